@@ -95,5 +95,6 @@ config = click.Option(
     is_eager=True,  # it sets defaults before any other option is looked at
     expose_value=False,
     callback=_apply,
-    help="Read options from this TOML file; the command line takes precedence.",
+    help="Read options from this TOML file; the command line takes precedence. Relative paths in it are from the "
+    "current folder.",
 )

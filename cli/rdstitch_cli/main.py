@@ -84,10 +84,13 @@ class Commands(click.Group):
         try:
             return super().parse_args(ctx, args)
         except click.NoSuchOption as error:
-            if any(
-                error.option_name in option.opts for command in self.load_all().values() for option in command.params
-            ):
-                ctx.fail(f"{error.option_name} belongs to a command: rdstitch pano {shlex.join(given)}")
+            params = [option for command in self.load_all().values() for option in command.params]
+            flags = {name: getattr(option, "is_flag", True) for option in params for name in option.opts}
+            if error.option_name in flags:
+                values = [k for k, word in enumerate(given, start=1) if not flags.get(word, True)]
+                at = next((k for k, word in enumerate(given) if word in _COMMANDS and k not in values), None)
+                command = ["pano"] if at is None else [given.pop(at)]
+                ctx.fail(f"{error.option_name} belongs to a command: rdstitch {shlex.join(command + given)}")
             raise
 
     def resolve_command(

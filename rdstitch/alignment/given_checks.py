@@ -84,8 +84,8 @@ def _fit_without_tilts(
     models = [name for name in without.models if not MODELS[name].on_sphere]
     # A model of one tilt shows no others.
     models = models if without.model == "auto" or options.attitudes is None else _WITH_TILTS
-    fit = select_model(bare, models).fit
-    if not fit.model.has_metric_poses:
+    fit = select_model(bare, models).fit if models else None
+    if fit is None or not fit.model.has_metric_poses:
         return None
     if fit.model.free_tilts and not fit.model.any_tilt:  # whose prior draws tilts together
         fit = bare.refine(POSE, start_from(bare, POSE, fit))

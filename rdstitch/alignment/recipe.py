@@ -235,6 +235,8 @@ def _check(given: GivenImages) -> None:
         raise ArgumentError("two links are between the same images")
     if options.reference is not None and not 0 <= options.reference < len(cameras):
         raise ArgumentError(f"the reference image {options.reference} is not among the {len(cameras)}")
+    if options.lens_known and len({camera.coefficients for camera in cameras}) > 1:
+        raise ArgumentError("the images have lenses that differ: those of one lens are aligned at a time")
 
 
 def _tree_ranks(observations: Observations, confirmed: IntArray) -> FloatArray:

@@ -113,7 +113,7 @@ def _only(cameras: Sequence[Value]) -> Value:
 
 def _own(content: Any, file: str, field: str = "") -> CameraFile:
     """What rdstitch wrote, alone or into the file of others."""
-    return CameraFile(convert(content, CameraRecord, file, field).camera(), "rdstitch")
+    return CameraFile(convert(content, CameraRecord, file, field, strict=False).camera(), "rdstitch")
 
 
 def save_camera(camera: Camera, path: str | Path, camera_format: CameraFormat = "auto") -> None:

@@ -258,12 +258,12 @@ def opencv_text(camera: Camera, *, yaml: bool = True, fisheye: bool = False) -> 
 
 def _calibration(camera: Camera, lens: LensModel, **further: Any) -> dict[str, Any]:
     """The fields that FileStorage and ROS share."""
-    (width, height), (cx, cy), focal = camera.image_size, camera.center, lens.mean_focal
+    (width, height), (cx, cy), (fx, fy) = camera.image_size, lens.center, lens.focal
     return {
         "image_width": width,
         "image_height": height,
         **further,
-        "camera_matrix": _matrix(3, focal, 0.0, cx, 0.0, focal, cy, 0.0, 0.0, 1.0),
+        "camera_matrix": _matrix(3, fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0),
         "distortion_coefficients": _matrix(1, *lens.coefficients),
     }
 
@@ -295,7 +295,7 @@ def camera_chain_yaml(camera: Camera) -> Written:
     model = _named(lens, "equi", "", "radtan")
     entry = {
         "camera_model": "pinhole",
-        "intrinsics": [*lens.focal, *camera.center],
+        "intrinsics": [*lens.focal, *lens.center],
         "distortion_model": model,
         "distortion_coeffs": list(lens.coefficients),
         "resolution": list(camera.image_size),
@@ -309,7 +309,7 @@ def colmap_text(camera: Camera) -> Written:
     lens, fit = nearest_model(camera, "rational", "fisheye", close=0.0)
     model = _named(lens, "OPENCV_FISHEYE", "FULL_OPENCV", "")
     # COLMAP's pixels have their centres at halves.
-    numbers = (*camera.image_size, *lens.focal, *(value + 0.5 for value in camera.center), *lens.coefficients)
+    numbers = (*camera.image_size, *lens.focal, *(value + 0.5 for value in lens.center), *lens.coefficients)
     heading = f"{comments(camera, fit, model)}# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
     return f"{heading}1 {model} {' '.join(map(repr, numbers))}\n", fit
 
@@ -320,19 +320,19 @@ def opendronemap_json(camera: Camera) -> Written:
     kind = _named(lens, "fisheye_opencv", "", "brown")
     names = ("k1", "k2", "k3", "k4") if lens.fisheye else ("k1", "k2", "p1", "p2", "k3")
     (width, height), longer = camera.image_size, max(camera.image_size)
-    focal = lens.mean_focal / longer
+    fx, fy = (value / longer for value in lens.focal)
     entry = {
         "projection_type": kind,
         "width": width,
         "height": height,
-        "focal_x": focal,
-        "focal_y": focal,
-        "c_x": (camera.center[0] - (width - 1) / 2) / longer,
-        "c_y": (camera.center[1] - (height - 1) / 2) / longer,
+        "focal_x": fx,
+        "focal_y": fy,
+        "c_x": (lens.center[0] - (width - 1) / 2) / longer,
+        "c_y": (lens.center[1] - (height - 1) / 2) / longer,
         **dict(zip(names, lens.coefficients, strict=True)),
         OWN: _own(camera, fit),
     }
-    return json.dumps({f"v2 unknown unknown {width} {height} {kind} {focal:.4g}": entry}, indent=4) + "\n", fit
+    return json.dumps({f"v2 unknown unknown {width} {height} {kind} {fx:.4g}": entry}, indent=4) + "\n", fit
 
 
 def comments(camera: Camera, fit: LensFit, model: str) -> str:
@@ -351,10 +351,20 @@ def _as_yaml(content: dict[str, Any], *, opencv: bool = True) -> str:
     lines = []
     for key, value in content.items():
         if not isinstance(value, dict):
-            lines.append(f"{key}: {json.dumps(value)}")
+            lines.append(f"{key}: {_as_yaml_value(value)}")
             continue
         matrix = "type_id" in value
         lines.append(f"{key}: !!opencv-matrix" if matrix and opencv else f"{key}:")
         left_out = ("type_id",) if opencv or not matrix else ("type_id", "dt")
-        lines += [f"   {name}: {json.dumps(item)}" for name, item in value.items() if name not in left_out]
+        lines += [f"   {name}: {_as_yaml_value(item)}" for name, item in value.items() if name not in left_out]
     return "\n".join(lines) + "\n"
+
+
+def _as_yaml_value(value: Any) -> str:
+    """A number, text, list or object: YAML 1.1 takes numbers with an exponent, but without a dot, for texts."""
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_as_yaml_value, value))}]"
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key}: {_as_yaml_value(item)}' for key, item in value.items())}}}"
+    text = json.dumps(value)
+    return text.replace("e", ".0e") if isinstance(value, float) and "." not in text else text

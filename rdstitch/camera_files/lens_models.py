@@ -5,7 +5,8 @@ in pixels is stated. The division model has λ alone where that is enough, else 
 the camera, whose images are resampled by it.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -50,29 +51,31 @@ def _least_squares(terms: FloatArray, values: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class LensSamples:
-    """Radii of points all over what is drawn of an image, N of them."""
+    """N points all over what is drawn of an image, and how the radii of models that are fitted must be there."""
 
-    undistorted: FloatArray  # undistorted, distorted: (N,): from the distortion centre, focal lengths
-    distorted: FloatArray
-    focal: float  # pixels; guessed where the camera has none
+    straight: FloatArray  # (N, 2): where a lens without distortion shows them, pixels
+    measured: FloatArray  # (N, 2): where the lens does
+    undistorted: FloatArray  # (N,): radii of ``straight``, from the distortion centre, focal lengths
+    distorted: FloatArray  # (N,): the same of ``measured`` along these directions, without what the model has besides
 
     @classmethod
-    def of(cls, camera: Camera) -> Self:
-        """Sample a camera."""
-        focal = camera.with_focal().focal
-        assert focal is not None
+    def of(cls, camera: Camera, base: LensModel) -> Self:
+        """Sample a camera for models with the focal lengths, centre and tangential terms of ``base``."""
         measured = points_over(camera.image_size, _GRID)
-        bent = np.linalg.norm(measured - camera.center, axis=1)
-        drawn = bent <= camera.drawn_radius
-        straight = np.linalg.norm(camera.undistort(measured[drawn]) - camera.center, axis=1)
-        return cls(straight / focal, bent[drawn] / focal, focal)
+        measured = measured[np.linalg.norm(measured - camera.center, axis=1) <= camera.drawn_radius]
+        straight = (camera.lens_model or camera).undistort(measured)
+        known = np.isfinite(straight).all(axis=1)
+        straight, measured = straight[known], measured[known]
+        flat = (straight - base.center) / base.mean_focal
+        radius = np.linalg.norm(flat, axis=1)
+        moved = np.einsum("ij,ij->i", (measured - base.distort(straight)) / base.focal, flat)
+        return cls(straight, measured, radius, radius + moved / np.maximum(radius, 1e-300))
 
-    def fit(self, start: FloatArray, terms: FloatArray) -> tuple[FloatArray, LensFit]:
-        """Find coefficients (K,) for which ``start + terms k`` are the measured radii; ``terms`` of shape (N, K)."""
-        coefficients = _least_squares(terms, self.distorted - start)
-        return coefficients, self._compare(start + terms @ coefficients)
+    def fit(self, start: FloatArray, powers: Sequence[int], size: float = 1.0) -> FloatArray:
+        """Find coefficients (K,): ``u + Σ k (size u)^p / size`` are the measured radii, ``u`` those of ``start``."""
+        return _least_squares((start[:, None] * size) ** np.array(powers) / size, self.distorted - start)
 
-    def fit_rational(self) -> tuple[FloatArray, LensFit]:
+    def fit_rational(self) -> FloatArray:
         """Find coefficients (6,): ``u (1 + k1 u² + k2 u⁴ + k3 u⁶) / (1 + k4 u² + k5 u⁴ + k6 u⁶)`` are the radii.
 
         Linear least squares, weighted by the denominator of the step before; of all steps the one with the smallest
@@ -82,19 +85,20 @@ class LensSamples:
         size = float(self.undistorted.max())
         powers = (self.undistorted[:, None] / size) ** np.array([2, 4, 6])
         terms = np.hstack([self.undistorted[:, None] * powers, -self.distorted[:, None] * powers])
-        denominator, fits = np.ones_like(self.distorted), [(np.zeros(6), self._compare(self.undistorted))]
+        denominator, best = np.ones_like(self.distorted), np.zeros(6)
+        least = np.abs(self.undistorted - self.distorted).max()
         for _ in range(_RATIONAL_STEPS):
             k = _least_squares(terms / denominator[:, None], (self.distorted - self.undistorted) / denominator)
             denominator = 1.0 + powers @ k[3:]
             if not (denominator > 1e-3).all():
                 break
-            fits.append((k, self._compare(self.undistorted * (1.0 + powers @ k[:3]) / denominator)))
-        coefficients, fit = min(fits, key=lambda one: one[1].largest)
-        return coefficients / np.tile(size ** np.array([2.0, 4.0, 6.0]), 2), fit
+            error = np.abs(self.undistorted * (1.0 + powers @ k[:3]) / denominator - self.distorted).max()
+            best, least = (k, error) if error < least else (best, least)
+        return np.asarray(best / np.tile(size ** np.array([2.0, 4.0, 6.0]), 2))
 
-    def _compare(self, bent: FloatArray) -> LensFit:
-        """Compare a model's measured radii (N,) with these."""
-        error = np.abs(bent - self.distorted) * self.focal
+    def compare(self, lens: LensModel) -> LensFit:
+        """Compare a model's measured points with these."""
+        error = np.linalg.norm(lens.distort(self.straight) - self.measured, axis=1)
         return LensFit(float(np.sqrt(np.mean(error**2))), float(error.max()))
 
 
@@ -105,22 +109,45 @@ _MODELS: dict[str, tuple[tuple[int, ...], tuple[int | None, ...]]] = {
     "fisheye": ((3, 5, 7, 9), (0, 1, 2, 3)),
 }
 """Powers of the undistorted radius, or of a fisheye's angle, beside that itself; which of their coefficients each of
-OpenCV's is, None for 0."""
+OpenCV's is, None for the tangential ones."""
 
 
 def nearest_model(camera: Camera, *models: str, close: float = CLOSE) -> tuple[LensModel, LensFit]:
-    """Fit lens models of :data:`_MODELS` to a camera: the first that is so close, pixels, or else the nearest."""
-    samples, fits = LensSamples.of(camera), []
-    for model in models:
-        powers, places = _MODELS[model]
-        start = np.arctan(samples.undistorted) if model == "fisheye" else samples.undistorted
-        numbers, error = samples.fit(start, start[:, None] ** np.array(powers)) if powers else samples.fit_rational()
-        coefficients = tuple(0.0 if place is None else float(numbers[place]) for place in places)
-        kind: LensKind = "fisheye" if model == "fisheye" else "brown"
-        fits.append((LensModel((samples.focal,) * 2, camera.center, coefficients, kind), error))
-        if error.largest <= close:
+    """The lens as one of :data:`_MODELS`: the first that is so close, pixels, or else the nearest.
+
+    A lens of another program's calibration is given as it is where a model has all its terms; else the radial terms are
+    fitted, and its two focal lengths and its tangential terms kept.
+    """
+    lens, fits = camera.lens_model, []
+    kinds: dict[str, LensKind] = {model: "fisheye" if model == "fisheye" else "brown" for model in models}
+    if lens is not None and math.isclose(lens.mean_focal, camera.focal or 0.0):
+        for model, kind in kinds.items():
+            count = len(_MODELS[model][1])
+            if kind == lens.kind and not any(lens.coefficients[count:]):
+                padded = (*lens.coefficients, *[0.0] * count)[:count]
+                return replace(lens, coefficients=padded), LensFit(0.0, 0.0)
+    for model, kind in kinds.items():
+        (powers, places), base = _MODELS[model], _without_radial_terms(camera, kind)
+        samples = LensSamples.of(camera, base)
+        start = np.arctan(samples.undistorted) if kind == "fisheye" else samples.undistorted
+        numbers = samples.fit(start, powers) if powers else samples.fit_rational()
+        k = tuple(base.coefficients[i] if at is None else float(numbers[at]) for i, at in enumerate(places))
+        fits.append((fitted := replace(base, coefficients=k, kind=kind), samples.compare(fitted)))
+        if fits[-1][1].largest <= close:
             break
     return min(fits, key=lambda one: one[1].largest)
+
+
+def _without_radial_terms(camera: Camera, kind: LensKind) -> LensModel:
+    """The camera's focal length, and the two directions' difference and the tangential terms of its lens."""
+    lens, focal = camera.lens_model, camera.with_focal().focal
+    assert focal is not None
+    if lens is None:
+        return LensModel((focal, focal), camera.center, (0.0,) * 4)
+    unit = focal / lens.mean_focal
+    tangential = (*lens.coefficients, *[0.0] * 4)[2:4] if lens.kind == kind == "brown" else (0.0, 0.0)
+    k = (0.0, 0.0, *(value * unit for value in tangential))
+    return LensModel((lens.focal[0] * unit, lens.focal[1] * unit), lens.center, k)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ film.
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -149,11 +149,16 @@ class Polynomial:
 
 def fitted_polynomial(camera: Camera, unit: float, powers: tuple[int, ...]) -> Polynomial:
     """The polynomial of a camera by least squares; a fisheye's where that is nearer and the other one is not close."""
-    samples = LensSamples.of(camera)
-    size, lenses = samples.focal / unit, []
+    focal, lenses = camera.with_focal().focal, []
+    assert focal is not None
+    size, base = focal / unit, LensModel((focal, focal), camera.center, (), "polynomial")
+    samples = LensSamples.of(camera, base)
     for fisheye, straight in ((False, samples.undistorted), (True, np.arctan(samples.undistorted))):
-        values, fit = samples.fit(straight, (straight[:, None] * size) ** np.array(powers) / size)
-        lenses.append(Polynomial(powers, tuple(values.tolist()), samples.focal, fisheye, fit))
+        values = tuple(samples.fit(straight, powers, size).tolist())
+        terms = dict(zip(powers, values, strict=True))
+        series = tuple(terms.get(p, 0.0) * size ** (p - 1) for p in range(2, max(powers) + 1))
+        lens = replace(base, coefficients=series, kind="fisheye polynomial" if fisheye else "polynomial")
+        lenses.append(Polynomial(powers, values, focal, fisheye, samples.compare(lens)))
     return lenses[0] if lenses[0].fit.largest <= CLOSE else min(lenses, key=lambda lens: lens.fit.largest)
 
 

@@ -109,5 +109,6 @@ def compose_to_file(
         # Nothing goes on behind a writer that fails.
         with closing(prepared.strips(progress)) as strips:
             tags, workers = extra_tags(prepared.canvas), prepared.tiles.workers
-            written = write_strips(path, layout, strips, tags, outputs=outputs, workers=workers)
-    return FileComposite(prepared.canvas, written, prepared.messages, renderer.seams, prepared.tiles.box[:2])
+            written, notes = write_strips(path, layout, strips, tags, outputs=outputs, workers=workers)
+    messages = (*prepared.messages, *notes)
+    return FileComposite(prepared.canvas, written, messages, renderer.seams, prepared.tiles.box[:2])

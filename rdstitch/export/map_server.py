@@ -22,7 +22,7 @@ from rdstitch.io.read import read_image
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs, text_bytes
 
-_BYTES_A_PIXEL = 6  # grey levels and transparency, as they are, on the map, and while they are written
+_OUTPUT_BYTES, _MAP_BYTES = 2, 4  # of a pixel: grey levels and transparency, and on the map also while it is written
 
 
 def write_map(result: StitchResult, folder: Path, height: float, outputs: Outputs) -> None:
@@ -32,23 +32,23 @@ def write_map(result: StitchResult, folder: Path, height: float, outputs: Output
     """
     description, map_image = map_files(folder)
     to_metres = _pixel_to_metres(result, height)
+    columns, rows = result.canvas.size
+    resolution = math.sqrt(abs(float(np.linalg.det(to_metres[:, :2]))))
+    corners = np.array([(0, 0), (columns, 0), (columns, rows), (0, rows)]) - 0.5
+    outline = corners @ to_metres[:, :2].T + to_metres[:, 2]
+    origin = outline.min(axis=0)
+    width, length = np.ceil((outline.max(axis=0) - origin) / resolution - 1e-6).astype(int).tolist()
+    _check_memory(map_image, result, (width, length))
+    # The first pixel is at the top left, the origin at the bottom left of it all.
+    to_map = np.array([[1.0, 0.0], [0.0, -1.0]]) @ np.column_stack([to_metres[:, :2], to_metres[:, 2] - origin])
+    to_map = to_map / resolution + np.array([[0.0, 0.0, -0.5], [0.0, 0.0, length - 0.5]])
     assert result.output is not None
-    _check_memory(map_image, result)
     image = read_image(outputs.staged(result.output) or result.output)
     grey = image.pixels if image.pixels.ndim == 2 else cv2.cvtColor(image.pixels[..., :3], cv2.COLOR_RGB2GRAY)
     if grey.dtype != np.uint8:
         low, high = float(grey.min()), float(grey.max())
         grey = np.rint((grey - low) * (255.0 / max(high - low, 1e-12))).astype(np.uint8)
     alpha = np.full(grey.shape, 255, np.uint8) if image.alpha is None else image.alpha
-    resolution = math.sqrt(abs(float(np.linalg.det(to_metres[:, :2]))))
-    rows, columns = grey.shape
-    corners = np.array([(0, 0), (columns, 0), (columns, rows), (0, rows)]) - 0.5
-    outline = corners @ to_metres[:, :2].T + to_metres[:, 2]
-    origin = outline.min(axis=0)
-    width, length = np.ceil((outline.max(axis=0) - origin) / resolution - 1e-6).astype(int).tolist()
-    # The first pixel is at the top left, the origin at the bottom left of it all.
-    to_map = np.array([[1.0, 0.0], [0.0, -1.0]]) @ np.column_stack([to_metres[:, :2], to_metres[:, 2] - origin])
-    to_map = to_map / resolution + np.array([[0.0, 0.0, -0.5], [0.0, 0.0, length - 0.5]])
     shown = [cv2.warpAffine(layer, to_map, (width, length), flags=cv2.INTER_LINEAR) for layer in (grey, alpha)]
     grey, alpha = (np.asarray(layer, np.uint8) for layer in shown)
     spec = ImageSpec((width, length), 1, grey.dtype, transparent=True, metadata=Metadata((width, length)))
@@ -66,14 +66,14 @@ def write_map(result: StitchResult, folder: Path, height: float, outputs: Output
     outputs.write(description, text_bytes(lines))
 
 
-def _check_memory(file: Path, result: StitchResult) -> None:
+def _check_memory(file: Path, result: StitchResult, size: tuple[int, int]) -> None:
     """Refuse a map whose making would take more memory than there is: that the mosaic is kept counts more."""
-    sources, (width, height) = result.placed.sources, result.canvas.size
-    pixel = max(one.metadata.channels * max(one.metadata.bit_depth // 8, 1) for one in sources) + _BYTES_A_PIXEL
+    output, sources = result.canvas.size, result.placed.sources
+    pixel = max(one.metadata.channels * max(one.metadata.bit_depth // 8, 1) for one in sources) + _OUTPUT_BYTES
     limit = result.options.composite.max_memory or default_memory()
-    if (need := width * height * pixel) > limit:
+    if (need := math.prod(output) * pixel + math.prod(size) * _MAP_BYTES) > limit:
         raise LimitError(
-            f"{file}: a map of {width} x {height} pixels needs {need / 2**20:.0f} MB of memory, and there are "
+            f"{file}: a map of {size[0]} x {size[1]} pixels needs {need / 2**20:.0f} MB of memory, and there are "
             f"{limit / 2**20:.0f} MB; make the output smaller, with --scale or --max-size"
         )
 

@@ -9,8 +9,7 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.choices import TrajectoryFrame
 from rdstitch.errors import OutputError
 from rdstitch.export.trajectory_files import NOT_MEASURED, has_times, heading, positions_in_frame, ros_covariance
-from rdstitch.system.outputs import naming, replace_folder
-from rdstitch.system.temporary_folder import TemporaryFolder
+from rdstitch.system.outputs import Outputs
 
 
 def check_bag(file: Path, *, overwrite: bool) -> None:
@@ -20,17 +19,24 @@ def check_bag(file: Path, *, overwrite: bool) -> None:
     except ImportError:
         raise OutputError(f"{file}: writing ROS bags needs rosbags: pip install rosbags") from None
     if file.is_dir() and overwrite:
-        others = [item.name for item in file.iterdir() if item.suffix not in (".mcap", ".db3", ".yaml")]
-        if others or not (file / "metadata.yaml").is_file():
-            raise OutputError(f"{file}: is a folder, and not a ROS bag; choose another name")
+        _check_folder(file)
 
 
-def write_bag_folder(path: Trajectory, folder: Path, frame: TrajectoryFrame) -> None:
-    """Write the bag of ROS 2, whole or not at all, in the place of an older one."""
-    with naming(folder), TemporaryFolder(folder.parent, ".rdstitch-") as aside:
+def _check_folder(folder: Path) -> None:
+    """Refuse to replace a folder that is no bag of ROS 2."""
+    others = [item.name for item in folder.iterdir() if item.suffix not in (".mcap", ".db3", ".yaml")]
+    if others or not (folder / "metadata.yaml").is_file():
+        raise OutputError(f"{folder}: is a folder, and not a ROS bag; choose another name")
+
+
+def write_bag_folder(path: Trajectory, folder: Path, frame: TrajectoryFrame, outputs: Outputs) -> None:
+    """Stage the bag of ROS 2."""
+    with outputs.writing(folder, is_folder=True, check=_check_folder) as staged:
         # The files of a bag are named for their folder.
-        write_bag(path, aside / folder.name, frame)
-        replace_folder(aside / folder.name, folder)
+        write_bag(path, inner := staged / folder.name, frame)
+        for file in inner.iterdir():
+            file.rename(staged / file.name)
+        inner.rmdir()
 
 
 def write_bag(path: Trajectory, file: Path, frame: TrajectoryFrame) -> None:

@@ -12,6 +12,7 @@ from rdstitch.choices import PosesFrame
 from rdstitch.errors import ArgumentError
 from rdstitch.export.poses_files import geo_of_opendronemap, images_of_colmap
 from rdstitch.export.trajectory_files import as_csv
+from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.times import timestamps_of
 from rdstitch.results.stitch_result import StitchResult
 
@@ -52,6 +53,8 @@ def poses_file(result: StitchResult, file: str | Path, frame: PosesFrame = "enu"
     names = [source.name for source in sources]
     if any(source.metadata.orientation != 1 for source in sources):
         raise ArgumentError(f"{file}: images that EXIF turns have other axes there; turn the files first")
+    if blank := next((name for name in names if any(map(str.isspace, name))), None):
+        raise ArgumentError(f"{file}: names end at blanks there; rename {blank}")
     if name == "geo.txt":
         place = result.georeference
         poses, to_map = _poses_and_map(result)
@@ -64,4 +67,11 @@ def poses_file(result: StitchResult, file: str | Path, frame: PosesFrame = "enu"
         return geo_of_opendronemap(names, poses, to_map, place.crs.epsg, ground)
     if poses is None:
         raise ArgumentError(f"{file}: one homography per image has no poses; --model pose gives some")
+    if len({_lens(camera) for camera in result.registration.alignment.cameras}) > 1:
+        raise ArgumentError(f"{file}: the images are of several cameras or sizes, and there they have the same one")
     return images_of_colmap(names, poses, None if result.georeference is None else _poses_and_map(result)[1])
+
+
+def _lens(camera: Camera) -> tuple[object, ...]:
+    """What a camera of COLMAP has."""
+    return camera.image_size, camera.center, camera.focal, camera.coefficients, camera.lens_model

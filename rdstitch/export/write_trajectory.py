@@ -12,7 +12,7 @@ from rdstitch.system.outputs import Outputs, text_bytes
 def write_trajectory(
     path: Trajectory, file: Path, file_format: TrajectoryFormat, frame: TrajectoryFrame | None, outputs: Outputs
 ) -> None:
-    """Stage the file among the outputs; the bag of ROS 2, which is a folder, is put in its place at once."""
+    """Stage the file, or the folder that is a bag of ROS 2, among the outputs."""
     frame = frame or frame_of(file_format)
     if file_format != "bag":
         outputs.write(file, text_bytes(WRITERS[file_format](path, frame)))
@@ -20,4 +20,4 @@ def write_trajectory(
         with outputs.writing(file) as staged:
             write_bag(path, staged, frame)
     else:
-        write_bag_folder(path, file, frame)
+        write_bag_folder(path, file, frame, outputs)

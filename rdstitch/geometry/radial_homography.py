@@ -279,9 +279,9 @@ class RadialHomography:
         return cls(h, camera, camera2, none, iterations=iterations, reason=reason, ok=False)
 
     def reexpressed(self, homography: FloatArray, camera: Camera, camera2: Camera) -> Self:
-        """The same relation in other frames of the images, without covariance and motion, which were of those."""
-        none = np.empty((0, 0))
-        return replace(self, homography=homography, camera=camera, camera2=camera2, covariance=none, motion=None)
+        """The relation with another homography, or the same in other frames, without what was of the one before."""
+        moved = replace(self, homography=homography, camera=camera, camera2=camera2)
+        return replace(moved, covariance=np.empty((0, 0)), parameters=(), motion=None)
 
     def __repr__(self) -> str:
         if not self.ok:

@@ -17,7 +17,7 @@ from rdstitch.inputs.rosbag import extract_images, is_bag
 from rdstitch.io.opening import HEIF_SUFFIXES
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
 from rdstitch.results.messages import Message, shortened
-from rdstitch.system.file_access import is_url, read_text, remote_names
+from rdstitch.system.file_access import is_url, read_text, remote_names, without_query
 
 _MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pattern takes the square of its length
 
@@ -46,8 +46,9 @@ class Clip:
             images, wanted = extract_images(self.path, folder, every, topic)
             return images, wanted.messages(self.path)
         wanted = wanted_frames(every, partial(grey_frames, self.path))
-        written = extract_frames(self.path, folder, wanted.__contains__)
-        return [Frame(*frame) for frame in written], wanted.messages(self.path)
+        written, damage = extract_frames(self.path, folder, wanted.__contains__)
+        damages = [Message(damage, (str(self.path),), code="damaged")] if damage else []
+        return [Frame(*frame) for frame in written], [*damages, *wanted.messages(self.path)]
 
     def unused_among(self, images: int) -> Message:
         """Why it is not used beside images."""
@@ -84,7 +85,9 @@ def expanded(arguments: Iterable[Named], lists: tuple[Path, ...] = ()) -> Expand
 def _named_by(argument: Named, lists: tuple[Path, ...]) -> Expanded:
     if isinstance(argument, Frame):
         return Expanded([NamedImage(argument)])
-    path, text = Path(argument), str(argument)
+    path, text = Path(argument), os.fspath(argument)
+    if not text:  # which a path takes for the current folder
+        raise InputError("one of the names of images is empty; was a variable of the shell not set?")
     if is_url(path):
         return _at_url(text)
     if not _exists(path):
@@ -107,11 +110,10 @@ def _named_by(argument: Named, lists: tuple[Path, ...]) -> Expanded:
 
 def _at_url(url: str) -> Expanded:
     """The image, or the images of the folder or pattern, that a URL names."""
-    path = Path(url)
-    pattern = glob.has_magic(path.name)
-    if not pattern and path.suffix.lower() in READABLE_SUFFIXES:
+    path, address = Path(url), without_query(Path(url))
+    if not glob.has_magic(address.name) and address.suffix.lower() in READABLE_SUFFIXES:
         return Expanded([NamedImage(Frame(path))])
-    if path.suffix.lower() in VIDEO_SUFFIXES:
+    if address.suffix.lower() in VIDEO_SUFFIXES:
         raise InputError(f"{path}: only images are read from other machines; download the video first")
     try:
         found = sorted(map(Path, remote_names(url)), key=natural_key)

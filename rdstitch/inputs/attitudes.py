@@ -1,7 +1,7 @@
 """Measured tilts of images: of their XMP, of a table by name, or of an IMU by time, between which is interpolated."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,8 +12,9 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.geometry.planar_motion import tilt_from_normal, turned_tilt
 from rdstitch.inputs.delays import DELAYS, MeasuredTilt
+from rdstitch.inputs.rows_of_images import RowsByImage
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, by_image, csv_rows
+from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, csv_rows
 from rdstitch.inputs.times import timestamps_of
 from rdstitch.results.messages import shortened
 from rdstitch.system.file_access import cached_by_file_state, read_text
@@ -36,7 +37,7 @@ def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list
     """
     if wanted is None:
         return list(sources)
-    return _of_images(sources) if wanted == XMP else [_of_table(source, wanted) for source in sources]
+    return _of_images(sources) if wanted == XMP else _of_table(sources, wanted)
 
 
 def _of_images(sources: Sequence[Source]) -> list[Source]:
@@ -62,28 +63,29 @@ def _of_images(sources: Sequence[Source]) -> list[Source]:
     return measured
 
 
-def _of_table(source: Source, file: str | Path) -> Source:
-    """A source with (ψ, θ), radians, of its line, or of its time, and then at delays too."""
-    table, turn = _read_attitudes(file), turning_matrix(source.metadata.orientation)
-    if not len(table.times):
-        return replace(source, attitude=MeasuredTilt(turned_tilt(table.of(source, file), turn)))
-    tilts = [turned_tilt((psi, theta), turn) for psi, theta in table.at(table.time_of(source, file) + DELAYS).tolist()]
-    return replace(source, attitude=MeasuredTilt(tilts[len(DELAYS) // 2], np.array(tilts)))
+def _of_table(sources: Sequence[Source], file: str | Path) -> list[Source]:
+    """The sources with (ψ, θ), radians, of their lines, or of their times, and then at delays too."""
+    table, measured = _read_attitudes(file), []
+    rows = table.of(sources) if isinstance(table, RowsByImage) else [None] * len(sources)
+    for source, row in zip(sources, rows, strict=True):
+        turn = turning_matrix(source.metadata.orientation)
+        if not isinstance(table, RowsByImage):
+            tilts = [turned_tilt((psi, theta), turn) for psi, theta in table.at(source, file).tolist()]
+            attitude = MeasuredTilt(tilts[len(DELAYS) // 2], np.array(tilts))
+        elif row is None:
+            raise InputError(f"{file}: has no line for {source.name}; add one with its psi and theta")
+        else:
+            attitude = MeasuredTilt(turned_tilt(_tilt_of(row), turn))
+        measured.append(replace(source, attitude=attitude))
+    return measured
 
 
 @dataclass(frozen=True, eq=False)
-class _AttitudeTable:
-    """Attitudes (ψ, θ), radians, by the names of images, or by time as an IMU measures them at its own rate."""
+class _TimedAttitudes:
+    """Attitudes by time, as an IMU measures them at its own rate."""
 
-    named: Mapping[str, tuple[float, float]]
-    times: FloatArray  # (M,), s, ascending; empty where they are by name
-    tilts: FloatArray  # (M, 2)
-
-    def of(self, source: Source, file: str | Path) -> tuple[float, float]:
-        """Of one image by its name."""
-        if source.name not in self.named:
-            raise InputError(f"{file}: has no line for {source.name}; add one with its psi and theta")
-        return self.named[source.name]
+    times: FloatArray  # (M,), s, ascending
+    tilts: FloatArray  # (M, 2): (ψ, θ), radians
 
     def time_of(self, source: Source, file: str | Path) -> float:
         """When an image was taken, which must lie within the table."""
@@ -98,28 +100,22 @@ class _AttitudeTable:
             )
         return time
 
-    def at(self, times: FloatArray) -> FloatArray:
-        """(ψ, θ) (K, 2) at times (K,), interpolated."""
+    def at(self, source: Source, file: str | Path) -> FloatArray:
+        """(ψ, θ) (K, 2) of an image at :data:`DELAYS` (K,), interpolated."""
+        times = self.time_of(source, file) + DELAYS
         return np.stack([np.interp(times, self.times, values) for values in self.tilts.T], axis=1)
 
 
 @cached_by_file_state
-def _read_attitudes(file: str | Path) -> _AttitudeTable:
+def _read_attitudes(file: str | Path) -> RowsByImage | _TimedAttitudes:
     wanted = ("name,psi,theta", "timestamp,psi,theta", "timestamp,qx,qy,qz,qw")
     rows = csv_rows(read_text(file), str(file), _COLUMNS, wanted, ("deg", "degrees", "s"))
-    by_name = any("name" in row.values for row in rows)
-    tilts = []
-    for row in rows:
-        psi, theta = _tilt_of(row)
-        if not (abs(psi) < math.pi / 2 and abs(theta) < math.pi / 2):
-            raise InputError(f"{row.where}: psi and theta must lie between -90 and 90 degrees")
-        tilts.append((psi, theta))
-    if by_name:
-        named = dict(zip(by_image(rows), tilts, strict=True))
-        return _AttitudeTable(named, np.empty(0), np.empty((0, 2)))
+    tilts = [_tilt_of(row) for row in rows]
+    if any("name" in row.values for row in rows):
+        return RowsByImage(rows)
     times = np.array([row.needed("timestamp") for row in rows])
     order = np.argsort(times, kind="stable")
-    return _AttitudeTable({}, times[order], np.array(tilts).reshape(-1, 2)[order])
+    return _TimedAttitudes(times[order], np.array(tilts).reshape(-1, 2)[order])
 
 
 def _tilt_of(row: Row) -> tuple[float, float]:
@@ -128,7 +124,10 @@ def _tilt_of(row: Row) -> tuple[float, float]:
     The lens of that looks down, and the top of the image is ahead.
     """
     if "qw" not in row.values:
-        return math.radians(row.needed("psi")), math.radians(row.needed("theta"))
+        psi, theta = row.needed("psi"), row.needed("theta")
+        if not (abs(psi) < 90.0 and abs(theta) < 90.0):
+            raise InputError(f"{row.where}: psi and theta must lie between -90 and 90 degrees")
+        return math.radians(psi), math.radians(theta)
     x, y, z, w = (row.needed(name) for name in ("qx", "qy", "qz", "qw"))
     if not 0.99 < math.hypot(x, y, z, w) < 1.01:
         raise InputError(f"{row.where}: qx, qy, qz, qw are not a unit quaternion")

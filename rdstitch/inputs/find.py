@@ -12,7 +12,7 @@ from rdstitch.inputs.arguments import NamedImage, expanded
 from rdstitch.inputs.frame import Frame, Named, files_of
 from rdstitch.inputs.image_folders import is_rdstitch_output, place_of
 from rdstitch.results.messages import Message, names_of, shortened
-from rdstitch.system.file_access import canonical_name, is_url
+from rdstitch.system.file_access import canonical_name, is_url, without_query
 from rdstitch.system.temporary_folder import TemporaryFolder
 
 
@@ -119,16 +119,17 @@ def find_images(
 def _labelled(frames: Sequence[Frame]) -> list[Frame]:
     """The same; those of one file name are called by as many of their folders too as tell them from each other."""
     places: dict[str, set[tuple[str, ...]]] = {}
-    for frame in frames:
-        places.setdefault(frame.path.name, set()).add(place_of(frame.path).parts)
+    located = [place_of(without_query(frame.path)) for frame in frames]
+    for place in located:
+        places.setdefault(place.name, set()).add(place.parts)
     depth = {
         name: next(n for n in count(1) if len({parts[-n:] for parts in alike}) == len(alike))
         for name, alike in places.items()
         if len(alike) > 1
     }
     return [
-        replace(frame, label=canonical_name("/".join(place_of(frame.path).parts[-depth[frame.path.name] :])))
-        if frame.path.name in depth and not frame.label and frame.image is None
+        replace(frame, label=canonical_name("/".join(place.parts[-depth[place.name] :])))
+        if place.name in depth and not frame.label and frame.image is None
         else frame
-        for frame in frames
+        for frame, place in zip(frames, located, strict=True)
     ]

@@ -15,7 +15,7 @@ from rdstitch.choices import ChannelOrder
 from rdstitch.errors import ArgumentError
 from rdstitch.io.metadata import Metadata, metadata_of
 from rdstitch.io.read import DecodedImage, as_image, from_pillow
-from rdstitch.system.file_access import canonical_name
+from rdstitch.system.file_access import canonical_name, without_query
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class Frame:
     @property
     def name(self) -> str:
         """What it is called in messages, tables and files, the same in every locale."""
-        return self.label or canonical_name(self.path.name)
+        return self.label or canonical_name(without_query(self.path).name)
 
 
 def frame_numbers(listed: Sequence[Frame]) -> list[int]:

@@ -1,7 +1,7 @@
 """Ground control points, by OpenDroneMap's list or a table."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -13,9 +13,10 @@ from rdstitch.geometry.crs import WGS84, Crs
 from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.inputs.positions import COLUMNS, UNITS, accuracy_of, geographic_places
+from rdstitch.inputs.rows_of_images import ImagesByName
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import Row, csv_rows
-from rdstitch.system.file_access import canonical_text, read_text
+from rdstitch.system.file_access import read_text
 
 _ACCURACIES = {name: aliases for name, aliases in COLUMNS.items() if name.endswith("std")}
 _CONTROL = {
@@ -51,9 +52,8 @@ def with_ground_control(
     rows: Iterable[Row]
     header = next((line for line in body.splitlines() if line.strip()), "")
     if re.match(r"\W*[A-Za-z_ ./()]+[,;\t]", header):
-        listed = csv_rows(body, str(file), _CONTROL, _CONTROL_WANTED, UNITS)
-        rows = [replace(row, values={**row.values, "name": row.image}) for row in listed]
-        epsg = WGS84 if any("latitude" in row.values for row in listed) else epsg
+        rows = csv_rows(body, str(file), _CONTROL, _CONTROL_WANTED, UNITS)
+        epsg = WGS84 if any("latitude" in row.values for row in rows) else epsg
     else:
         rows = _opendronemap(body, str(file))
     system = system or (None if epsg is None else NamedSystem(f"EPSG:{epsg}", epsg))
@@ -61,42 +61,44 @@ def with_ground_control(
         raise InputError(
             f"{file}: line 1: expected a coordinate system like EPSG:32632 or WGS84 UTM 32N; or give --crs"
         )
-    marks = _marks(rows, {source.name: source.metadata.size for source in sources})
+    marks = _marks(rows, sources)
     if not marks:
         raise InputError(f"{file}: has no ground control point in any of the images")
     places = geographic_places(system, np.array([mark.place for mark in marks]), str(file))
     on_map = system.epsg is not None and system.epsg != WGS84 and Crs.in_metres(system.epsg) is not None
     code = system.epsg if on_map and system.epsg is not None else WGS84
-    control: dict[str, list[GroundControl]] = {}
+    control = list(sources)
     for mark, degrees in zip(marks, places, strict=True):
         one = GroundControl(mark.point, GpsPosition(*degrees), code, mark.pixel, mark.std, check=check)
-        control.setdefault(mark.image, []).append(one)
-    return [replace(source, control=(*source.control, *control.get(source.name, ()))) for source in sources]
+        control[mark.image] = replace(control[mark.image], control=(*control[mark.image].control, one))
+    return control
 
 
 class _Mark(NamedTuple):
     """A point in an image."""
 
-    image: str
+    image: int  # its index
     point: str
     place: tuple[float, float]  # x, y in the system of the list
     pixel: tuple[float, float]
     std: float | None  # of a coordinate of the place, m
 
 
-def _marks(rows: Iterable[Row], sizes: Mapping[str, tuple[int, int]]) -> list[_Mark]:
-    """The points in images of these names and sizes."""
-    marks = []
+def _marks(rows: Iterable[Row], sources: Sequence[Source]) -> list[_Mark]:
+    """The points in these images."""
+    marks, names = [], ImagesByName(sources)
     for row in rows:
-        image, point = _image_and_point(" ".join(filter(None, map(row.values.get, ("name", "point")))), sizes)
-        if image is None:
-            continue
-        x, y = (row.needed(names[names[0] not in row.values]) for names in (("longitude", "x"), ("latitude", "y")))
-        pixel = row.needed("px"), row.needed("py")
-        if not all(-0.5 <= at < side - 0.5 for at, side in zip(pixel, sizes[image], strict=True)):
-            raise InputError(f"{row.where}: is not within the {'{} x {}'.format(*sizes[image])} pixels of {image}")
-        accuracy = accuracy_of(row)
-        marks.append(_Mark(image, point or f"{x:.12g} {y:.12g}", (x, y), pixel, accuracy and accuracy[0]))
+        images, point = _images_and_point(row, names)
+        place = ("longitude", "latitude") if "longitude" in row.values else ("x", "y")
+        for image in images:
+            x, y, *pixel = map(row.needed, (*place, "px", "py"))
+            width, height = sources[image].metadata.size
+            if not (-0.5 <= pixel[0] < width - 0.5 and -0.5 <= pixel[1] < height - 0.5):
+                where = f"the {width} x {height} pixels of {sources[image].name}"
+                raise InputError(f"{row.where}: is not within {where}")
+            accuracy = accuracy_of(row)
+            named = point or f"{x:.12g} {y:.12g}"
+            marks.append(_Mark(image, named, (x, y), (pixel[0], pixel[1]), accuracy and accuracy[0]))
     return marks
 
 
@@ -109,14 +111,13 @@ def _opendronemap(text: str, file: str) -> Iterator[Row]:
         row = Row(f"{file}: line {number}", dict(zip(_CONTROL_LISTED, fields, strict=False)), ".")
         if len(fields) < 6:
             raise InputError(f"{row.where}: expected X Y Z PX PY IMAGE [NAME]")
-        yield replace(row, values={**row.values, "name": canonical_text(fields[5].strip())})
+        yield row
 
 
-def _image_and_point(text: str, names: Iterable[str]) -> tuple[str | None, str]:
-    """The image that the rest of a line begins with, which may have spaces and other case, and the point's name."""
-    for same in (str, str.casefold):
-        begun = [name for name in names if f"{same(text)} ".startswith(f"{same(name)} ")]
-        if begun:
-            image = max(begun, key=len)
-            return image, text[len(image) :].strip()
-    return None, ""
+def _images_and_point(row: Row, names: ImagesByName) -> tuple[list[int], str]:
+    """Indices of the image that a row names, which may have spaces, and the point's name, which may follow it."""
+    text = row.values.get("name") or row.image
+    for end in sorted((found.start() for found in re.finditer(r"\s+|$", text)), reverse=True):
+        if images := names.find(text[:end], row.where)[0]:
+            return images, text[end:].strip() or row.values.get("point", "")
+    return [], ""

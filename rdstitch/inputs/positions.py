@@ -12,8 +12,7 @@ a coordinate system, then lines   OpenDroneMap's ``geo.txt``: NAME X Y [Z … HO
 
 import math
 import re
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,8 +23,9 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.crs import WGS84
 from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.named_system import NamedSystem
+from rdstitch.inputs.rows_of_images import RowsByImage
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import NUMERAL, Row, by_image, csv_rows, json_rows, listed_rows
+from rdstitch.inputs.tables import NUMERAL, Row, csv_rows, json_rows, listed_rows
 from rdstitch.inputs.tracks import by_events, is_list_of_events, on_track, subtitle_points, track_points
 from rdstitch.system.file_access import read_text
 
@@ -94,26 +94,22 @@ def _places(sources: Sequence[Source], file: str | Path, epsg: int | None, offse
             rows, system = listed_rows("".join(lines[1:]).splitlines(), name, _LISTED, 2), named
         else:
             rows = csv_rows(text, name, COLUMNS, _WANTED, UNITS)
-        table = _table(rows, name, system)
-        called = _same_names(sources, table)
-        places = [table.get(called[source.name]) for source in sources]
+        named_rows = RowsByImage(row for row in rows if _coordinates(row) is not None)
+        places = _by_rows(named_rows.of(sources), name, system)
         if not any(places):
             raise InputError(f"{file}: has no position of {sources[0].name}, nor of any other of the images")
     return places
 
 
-def _table(rows: Iterable[Row], file: str, system: NamedSystem | None) -> dict[str, GpsPosition]:
-    """The positions by the names of the images; what has no position, or no fix, is not in it."""
-    table: dict[str, GpsPosition] = {}
-    projected: dict[str, tuple[float, float]] = {}
-    placed = []
-    for row in rows:
-        geographic = not row.values.keys().isdisjoint(("latitude", "longitude"))
-        y, x = (_degrees(row, *c) for c in _SIDES) if geographic else (row.number("y"), row.number("x"))
-        if x is not None and y is not None and not (geographic and x == y == 0.0):
-            placed.append((row, x, y, geographic))
-    by_image(row for row, *_ in placed)
-    for row, x, y, geographic in placed:
+def _by_rows(rows: Sequence[Row | None], file: str, system: NamedSystem | None) -> list[GpsPosition | None]:
+    """The positions that rows tell."""
+    places: list[GpsPosition | None] = []
+    projected: dict[int, tuple[float, float]] = {}  # by index
+    for index, row in enumerate(rows):
+        if row is None or (found := _coordinates(row)) is None:
+            places.append(None)
+            continue
+        x, y, geographic = found
         altitude = next(iter(row.numbers_within("altitude")), None)
         if altitude is not None and "below" in row.values["altitude"].lower():
             altitude = -altitude
@@ -123,14 +119,22 @@ def _table(rows: Iterable[Row], file: str, system: NamedSystem | None) -> dict[s
         elif system is None:
             raise InputError(f"{row.where}: in which coordinate system x and y are is not known; give --crs")
         else:
-            projected[row.image] = x, y
-        table[row.image] = GpsPosition(y, x, altitude, accuracy_of(row))
+            projected[index] = x, y
+        places.append(GpsPosition(y, x, altitude, accuracy_of(row)))
     if projected:
         assert system is not None
-        places = geographic_places(system, np.array(list(projected.values())), file)
-        for name, (latitude, longitude) in zip(projected, places, strict=True):
-            table[name] = replace(table[name], latitude=latitude, longitude=longitude)
-    return table
+        degrees = geographic_places(system, np.array(list(projected.values())), file)
+        for index, (latitude, longitude) in zip(projected, degrees, strict=True):
+            place = places[index]
+            places[index] = place and replace(place, latitude=latitude, longitude=longitude)
+    return places
+
+
+def _coordinates(row: Row) -> tuple[float, float, bool] | None:
+    """X and y, and whether they are longitude and latitude; None where the row has no position, or no fix."""
+    geographic = not row.values.keys().isdisjoint(("latitude", "longitude"))
+    y, x = (_degrees(row, *c) for c in _SIDES) if geographic else (row.number("y"), row.number("x"))
+    return None if x is None or y is None or (geographic and x == y == 0.0) else (x, y, geographic)
 
 
 def accuracy_of(row: Row) -> tuple[float, float] | None:
@@ -169,13 +173,3 @@ def _degrees(row: Row, column: str, reference: str) -> float | None:
     if not sides and "deg" in text:
         raise InputError(f"{row.where}: '{text}' does not say whether north or south, east or west; add N, S, E or W")
     return -value if math.copysign(1.0, parts[0]) < 0.0 or sides & {"s", "w"} else value
-
-
-def _same_names(sources: Sequence[Source], listed: Iterable[str]) -> dict[str, str]:
-    """What a list calls each image: its name, or that in other case where only one image and one line are called so."""
-    names, lines = Counter(s.name.casefold() for s in sources), {name.casefold(): name for name in set(listed)}
-    known, names_in_list = set(listed), {}
-    for source in sources:
-        alike = lines.get(source.name.casefold(), source.name)
-        names_in_list[source.name] = alike if source.name not in known and names[alike.casefold()] == 1 else source.name
-    return names_in_list

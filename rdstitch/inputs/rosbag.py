@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from rdstitch.errors import InputError, OutputError
+from rdstitch.errors import InputError, RdstitchError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.keyframes import FrameSelection, wanted_frames
@@ -73,7 +73,7 @@ def opened_bag(path: Path) -> "Iterator[Any]":
     try:
         with AnyReader([bag], default_typestore=get_typestore(Stores.LATEST)) as reader:
             yield reader
-    except (InputError, OutputError):
+    except (RdstitchError, MemoryError):
         raise
     except Exception as error:  # rosbags raises many kinds on damaged files
         reason = " ".join(str(error).split()) or type(error).__name__

@@ -12,7 +12,7 @@ comma, semicolon or tab that is in the heading most often. Lines that begin with
 heading may stand in one. Numbers are read in either notation (``580,015.975``, ``580.015,975``, ``580'015.975``); what
 could be two numbers is one of them where the rest of the table shows the decimal mark, and refused elsewhere.
 
-Every complaint names the file and the line.
+Every complaint names the file and the line. Which image a row is about, :mod:`rdstitch.inputs.rows_of_images` finds.
 """
 
 import csv
@@ -52,10 +52,10 @@ class Row:
 
     @property
     def image(self) -> str:
-        """The name of the image's file, without its folder, whatever system wrote it; see :func:`image_name`."""
-        if not (name := image_name(self.values.get("name", ""))):
+        """The name of the image's file, without its folder."""
+        if not (parts := name_parts(self.values.get("name", ""))):
             raise InputError(f"{self.where}: has no name")
-        return name
+        return parts[-1]
 
     def number(self, column: str) -> float | None:
         """The finite number in a column; None where it is empty."""
@@ -93,19 +93,9 @@ def is_number(text: str) -> bool:
         return False
 
 
-def image_name(text: str) -> str:
-    """A file's name without its folders, those of Windows too, spelled as the names of images are."""
-    return canonical_text(re.split(r"[\\/]", text.strip())[-1])
-
-
-def by_image(rows: Iterable[Row]) -> dict[str, Row]:
-    """The rows by the names of their images, each of which may be there once."""
-    table: dict[str, Row] = {}
-    for row in rows:
-        if row.image in table:
-            raise InputError(f"{row.where}: {row.image} is here twice; remove one")
-        table[row.image] = row
-    return table
+def name_parts(text: str) -> tuple[str, ...]:
+    """A file's folders and its name, by whatever system they were written, spelled as the names of images are."""
+    return tuple(part for part in re.split(r"[\\/]", canonical_text(text.strip())) if part not in ("", ".", ".."))
 
 
 def csv_rows(

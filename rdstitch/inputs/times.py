@@ -10,9 +10,10 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame, frame_numbers
+from rdstitch.inputs.rows_of_images import RowsByImage
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, by_image, csv_rows, is_number
-from rdstitch.system.file_access import cached_by_file_state, canonical_name, read_text
+from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, csv_rows, is_number
+from rdstitch.system.file_access import cached_by_file_state, read_text
 
 _COLUMNS = {"name": IMAGE_NAMES, "timestamp": TIME_NAMES}
 
@@ -39,7 +40,7 @@ def with_times(frames: Sequence[Frame], file: str | Path | None) -> list[Frame]:
         return list(frames)
     named = _read_times(file)
     if not isinstance(named, list):
-        return [replace(frame, timestamp=_time_of(frame, named, file)) for frame in frames]
+        return [replace(frame, timestamp=time) for frame, time in zip(frames, _times(frames, named, file), strict=True)]
     numbers = np.array(frame_numbers(frames))
     if len(np.unique(numbers)) < len(numbers):  # of several videos
         numbers = np.arange(len(frames))
@@ -58,21 +59,23 @@ def time_of(frame: Frame, file: str | Path) -> float | None:
         named = _read_times(file)
         if isinstance(named, list):
             return named[frame.number] if frame.number is not None and frame.number < len(named) else None
-        return _time_of(frame, named, file)
+        return _times([frame], named, file)[0]
     except InputError:
         return None
 
 
-def _time_of(frame: Frame, named: dict[str, float], file: str | Path) -> float:
-    name = canonical_name(frame.path.name)
-    if name not in named:
-        raise InputError(f"{file}: has no time for {name}; add a line with its name and time")
-    return named[name]
+def _times(frames: Sequence[Frame], named: RowsByImage, file: str | Path) -> list[float]:
+    times = []
+    for frame, row in zip(frames, named.of(frames), strict=True):
+        if row is None:
+            raise InputError(f"{file}: has no time for {frame.name}; add a line with its name and time")
+        times.append(row.needed("timestamp"))
+    return times
 
 
 @cached_by_file_state
-def _read_times(file: str | Path) -> list[float] | dict[str, float]:
-    """The times in order, or by the names of the images of a file."""
+def _read_times(file: str | Path) -> list[float] | RowsByImage:
+    """The times in order, or by the names of images."""
     text, where = read_text(file), str(file)
     lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1)]
     lines = [(n, line) for n, line in lines if line and not line.startswith("#")]
@@ -88,4 +91,4 @@ def _read_times(file: str | Path) -> list[float] | dict[str, float]:
                 wanted = f"a table with the columns {','.join(_COLUMNS)}, lines TIMESTAMP NAME, or one time a line"
                 raise InputError(f"{file}: line {number}: found '{line}'; give {wanted}")
             rows.append(Row(f"{file}: line {number}", {"name": name, "timestamp": time}, "."))
-    return {name: row.needed("timestamp") for name, row in by_image(rows).items()}
+    return RowsByImage(rows)

@@ -42,11 +42,13 @@ from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile
 
 _BLACK_LEVEL = 50714
+_MAX_DPI = 1e6
 
 MAX_PROFILE = 2**20 - 2**10
 """Bytes of a colour profile: PNG readers, such as Pillow's, refuse images whose profile takes a megabyte."""
 
 _EXIF_OF_PNG = {"exif", "Raw profile type exif"}
+GREY_16 = ("I;16", "I;16B", "I;16L", "I;16N", "I")  # modes of Pillow's
 _COLOUR_SPACE = slice(16, 20)  # of a profile's header
 _HEADER = 16
 _XMP, _PROFILE, _RESOLUTION, _RESOLUTION_UNIT = 700, 34675, (282, 283), 296
@@ -68,7 +70,7 @@ class Metadata:
     make: str = ""  # make, model, serial: of the camera; empty where not known
     model: str = ""
     serial: str = ""
-    dpi: tuple[float, float] | None = None
+    dpi: tuple[float, float] | None = None  # across and down, as the file says it, which may be impossible
     # exposure time x sensitivity / f-number²: what the samples' light is proportional to, for the same scene
     exposure: float | None = None
     radiometry: Radiometry | None = None  # of a band of a multispectral camera
@@ -91,6 +93,11 @@ class Metadata:
         *direction, z = self.attitude.nadir
         x, y = (turning_matrix(self.orientation) @ direction).tolist()
         return x, y, z
+
+    @property
+    def resolution(self) -> tuple[float, float] | None:
+        """Its dpi where files can say that; None elsewhere."""
+        return self.dpi if self.dpi is not None and all(0.0 < each < _MAX_DPI for each in self.dpi) else None
 
     def in_another_size(self) -> Self:
         """Of the same image at the same scale but cut or extended."""
@@ -204,13 +211,18 @@ def _colour_profile(profile: object) -> tuple[bytes, str]:
 
 
 def _channels(image: Image.Image) -> int:
-    """Samples per pixel of what it is decoded to."""
+    """Samples per pixel of what it is decoded to, with alpha."""
+    return (1 if is_grey(image) else 3) + is_transparent(image)
+
+
+def is_transparent(image: Image.Image) -> bool:
+    """Check for alpha, or a colour that stands for it."""
+    return "a" in image.mode.lower().removeprefix("lab") or "transparency" in image.info
+
+
+def is_grey(image: Image.Image) -> bool:
+    """Check for grey samples, or a palette that holds shades of grey only."""
     if image.mode not in ("P", "PA"):
-        return len(image.getbands())
-    return (1 if is_grey_palette(image) else 3) + ("transparency" in image.info or image.mode == "PA")
-
-
-def is_grey_palette(image: Image.Image) -> bool:
-    """Check whether a palette holds shades of grey only."""
+        return image.mode in (*GREY_16, "1", "L", "LA", "La", "F")
     palette = np.array(image.getpalette("RGB") or [], dtype=np.uint8).reshape(-1, 3)
     return bool((palette == palette[:, :1]).all())

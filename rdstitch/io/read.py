@@ -12,20 +12,19 @@ from PIL import Image
 from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turned
 from rdstitch.io.colour import without_inks
-from rdstitch.io.metadata import Metadata, is_grey_palette, metadata_of, read_metadata
+from rdstitch.io.metadata import GREY_16, Metadata, is_grey, is_transparent, metadata_of, read_metadata
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image
 from rdstitch.io.raw import read_raw
 from rdstitch.io.read_jpeg import decoded_jpeg, most_bytes
 from rdstitch.io.read_tiff import as_opacity, read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
-from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME
+from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME, as_alpha
 from rdstitch.io.tiff_pages import first_image_pages
 from rdstitch.system.file_access import open_regular, read_beginning
 from rdstitch.system.late_imports import imagecodecs, tifffile
 
 _MAX_DECODED_REDUCTION = 8  # of the JPEG decoder
 _JPEG = ("JPEG", "MPO")
-_GREY_16 = ("I;16", "I;16B", "I;16L", "I;16N", "I")
 
 Pixels = NDArray[Any]
 
@@ -73,7 +72,7 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
         else:
             with opened_image(file) as opened:
                 metadata = metadata or metadata_of(opened)
-                if magic == PNG_MAGIC and metadata.bit_depth == 16 and opened.mode not in _GREY_16:
+                if magic == PNG_MAGIC and metadata.bit_depth == 16 and opened.mode not in GREY_16:
                     # Pillow would cut 16-bit colour to 8.
                     samples, alpha = _split(imagecodecs.png_decode(read_beginning(file, most_bytes(opened.size))))
                 else:
@@ -108,13 +107,13 @@ def from_pillow(image: Image.Image, factor: int = 1) -> tuple[Pixels, Pixels | N
         image.draft(None, (image.size[0] // factor, image.size[1] // factor))
         if image.size != wanted:
             raise ValueError(f"cannot be decoded at 1/{factor} of its size")
-    if image.mode in _GREY_16:
-        return _samples(image).astype(np.uint16), None
+    if image.mode in GREY_16:
+        samples, clear = _samples(image).astype(np.uint16), image.info.get("transparency")
+        return samples, None if clear is None else as_alpha(samples != clear)
     if image.mode == "F":
         return _samples(image), None
-    transparent = "A" in image.getbands() or "transparency" in image.info or image.mode in ("La", "RGBa")
+    transparent, grey = is_transparent(image), is_grey(image)
     image = without_inks(image)
-    grey = image.mode in ("1", "L", "LA", "La") or (image.mode == "P" and is_grey_palette(image))
     mode = "RGBA" if transparent else "L" if grey else "RGB"
     samples = _samples(image if image.mode == mode else image.convert(mode))
     if not transparent:

@@ -21,6 +21,7 @@ from rdstitch.io.samples import as_alpha
 from rdstitch.io.strips import ImageSpec, Strip, with_alpha
 from rdstitch.io.tiff_order import put_in_order
 from rdstitch.io.tiff_tiles import BUFFER, TILE, deflated, encoded_tile, has_predictor, tiles_of
+from rdstitch.results.messages import Message
 from rdstitch.system.late_imports import tifffile
 
 MIN_OVERVIEW = 256  # pixels along the longer side: smaller images need no overview
@@ -33,7 +34,9 @@ _COPIED_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.Artist, E
 ExtraTag = tuple[int, int, int, Any, bool]
 
 
-def write_tiff(path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()) -> None:
+def write_tiff(
+    path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()
+) -> list[Message]:
     """Write a TIFF file whose first page is the image and whose other pages are its overviews."""
     sizes = pyramid_sizes(spec.size, MIN_OVERVIEW)
     total = sum(w * h for w, h in sizes) * spec.samples_per_pixel * spec.dtype.itemsize
@@ -48,8 +51,7 @@ def write_tiff(path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_tags:
             if mask is not None:
                 _write_mask(tiff, size, mask, kind | _MASK)
                 mask.clear()
-    if len(sizes) > 1:
-        put_in_order(path)
+    return put_in_order(path) if len(sizes) > 1 else []
 
 
 def written_strips(path: Path) -> Iterator[Strip]:
@@ -104,7 +106,7 @@ def _write_page(
     samples = spec.channels + transparent
     colour = 3 if spec.channels == 3 and not spec.metadata.planes else 1
     extra = ["unspecified"] * (spec.channels - colour) + ["unassalpha"] * transparent
-    dpi = None if kind else spec.metadata.dpi
+    dpi = None if kind else spec.metadata.resolution
     tiff.write(
         (encoded_tile(tile) for tile in tiles_of(strips)),
         shape=(height, width, samples) if samples > 1 else (height, width),

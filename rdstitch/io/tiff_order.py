@@ -9,6 +9,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
+from rdstitch.results.messages import Message
 from rdstitch.system.late_imports import tifffile
 
 _OFFSETS = (324, 273)  # tags: of tiles and strips
@@ -29,12 +30,23 @@ class _Page(NamedTuple):
         return _head(room) + entries + room + longer
 
 
-def put_in_order(path: Path) -> None:
+def put_in_order(path: Path) -> list[Message]:
     """Rewrite a TIFF file: header, directories in their order, tiles of the last page, …, tiles of the first.
 
-    Needs room for a copy beside it.
+    Needs room for a copy beside it; where there is none the file, which is whole, stays, and a message says so.
     """
     ordered = path.with_name(f"{path.name}.ordered")
+    try:
+        _write_ordered(path, ordered)
+        ordered.replace(path)
+    except OSError as error:
+        ordered.unlink(missing_ok=True)
+        reason = error.strerror or error
+        return [Message(f"the TIFF file is whole, but not in the order of a Cloud Optimized GeoTIFF: {reason}")]
+    return []
+
+
+def _write_ordered(path: Path, ordered: Path) -> None:
     with tifffile.TiffFile(path) as tiff, path.open("rb") as source, ordered.open("wb") as target:
         order, room = tiff.byteorder, 8 if tiff.is_bigtiff else 4
         pages = [_page(source, page) for page in tiff.pages]
@@ -50,7 +62,6 @@ def put_in_order(path: Path) -> None:
         for page in reversed(pages):
             for offset, length in zip(page.offsets, page.lengths, strict=True):
                 target.write(_bytes_at(source, offset, length).ljust(_even(length), b"\0"))
-    ordered.replace(path)
 
 
 def _page(source: BinaryIO, page: "tifffile.TiffPage | tifffile.TiffFrame") -> _Page:

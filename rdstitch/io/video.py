@@ -18,6 +18,7 @@ from rdstitch.system.opencv_state import silent_opencv
 _FFMPEG_LEVEL, _FFMPEG_QUIET = "OPENCV_FFMPEG_LOGLEVEL", "-8"
 _ffmpeg_unloaded = Lock()  # until the first video of the process
 
+_CUT_OFF = 0.95  # of what the header says; in some containers that is an estimate
 VIDEO_SUFFIXES = frozenset((".mp4", ".mov", ".avi", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"))
 
 
@@ -36,17 +37,24 @@ def grey_frames(path: Path) -> Iterator[NDArray[np.uint8] | None]:
         yield np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), dtype=np.uint8) if decoded else None
 
 
-def extract_frames(path: Path, folder: Path, wanted: Callable[[int], bool]) -> list[VideoFrame]:
-    """Write frames of a video, those whose numbers are wanted, to a folder as PNG, named by video and frame number."""
+def extract_frames(path: Path, folder: Path, wanted: Callable[[int], bool]) -> tuple[list[VideoFrame], str]:
+    """Write frames of a video, those whose numbers are wanted, to a folder as PNG, named by video and frame number.
+
+    And why frames may be missing; empty where the video goes on as long as its header says.
+    """
     written: list[VideoFrame] = []
+    damage = ""
     for number, timestamp, capture in _grabbed(path):
+        count, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
+        cut_off = number + 1 < _CUT_OFF * count and timestamp * rate < _CUT_OFF * count
+        damage = f"ends after {number + 1} of {count:.0f} frames; copy it again from its source" if cut_off else ""
         decoded, frame = capture.retrieve() if wanted(number) else (False, None)
         if decoded and frame is not None:
             file = write_frame(folder / f"{path.stem}_{number:06d}.png", frame)
             written.append(VideoFrame(file, number, timestamp))
     if not written:
         raise InputError(f"{path}: the video has no frame that can be read")
-    return written
+    return written, damage
 
 
 def _grabbed(path: Path) -> Iterator[tuple[int, float, cv2.VideoCapture]]:

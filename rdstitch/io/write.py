@@ -25,6 +25,7 @@ from rdstitch.io.strips import STRIP_ROWS, ImageSpec, Strip, as_eight_bit, check
 from rdstitch.io.tiff import ExtraTag, write_tiff
 from rdstitch.io.write_jpeg import jpeg_pieces
 from rdstitch.io.write_png import png_pieces
+from rdstitch.results.messages import Message
 from rdstitch.system.outputs import Fingerprint, Outputs, check_folder, fingerprint, is_zarr, naming, tiles_folder
 
 _TIFF = (".tif", ".tiff")
@@ -72,14 +73,16 @@ def write_strips(
     *,
     outputs: Outputs | None = None,
     workers: int = 1,
-) -> Fingerprint:
+) -> tuple[Fingerprint, list[Message]]:
     """Write an image that comes in strips; see :func:`write_image`. Gives size and digest of what was written.
+
+    And what the user should know of it.
 
     ``workers``: threads that may encode, beside what makes the next strips.
     """
     file = Path(path)
     check_format(file, spec)
-    checked, tiles = check_strips(spec, strips), None
+    checked, tiles, messages = check_strips(spec, strips), None, list[Message]()
     with Outputs.or_own(outputs) as staging:
         if file.suffix.lower() == ".dzi":
             folder = tiles_folder(Path(os.path.realpath(file)))
@@ -91,22 +94,21 @@ def write_strips(
                 write_ome_zarr(staged, spec, checked)
         else:
             with staging.writing(file) as staged:
-                _write_file(staged, file.name.lower(), spec, checked, extra_tags, workers)
+                messages = _write_file(staged, file.name.lower(), spec, checked, extra_tags, workers)
         with naming(file):
-            return fingerprint(staged, tiles)
+            return fingerprint(staged, tiles), messages
 
 
 def _write_file(
     file: Path, name: str, spec: ImageSpec, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag], workers: int
-) -> None:
+) -> list[Message]:
     """Write one file in the format that the end of a name stands for."""
     if name.endswith(OME_SUFFIXES):
         write_ome_tiff(file, spec, strips, extra_tags)
-        return
+        return []
     suffix = Path(name).suffix
     if suffix in _TIFF:
-        write_tiff(file, spec, strips, extra_tags)
-        return
+        return write_tiff(file, spec, strips, extra_tags)
     pieces: Iterable[bytes | memoryview]
     if suffix in _JPEG:
         pieces = jpeg_pieces(spec, strips, workers)
@@ -116,6 +118,7 @@ def _write_file(
         pieces = [_webp(spec, strips)]
     with file.open("wb") as stream:
         stream.writelines(pieces)
+    return []
 
 
 def _webp(spec: ImageSpec, strips: Iterable[Strip]) -> bytes:

@@ -105,8 +105,8 @@ def _embedded(head: bytes, metadata: Metadata) -> list[bytes]:
     if head[3] == _JFIF:
         after_header = 4 + struct.unpack_from(">H", head, 4)[0]
         jfif = head[2:after_header]
-        if metadata.dpi is not None and all(0 < d < 65535 for d in metadata.dpi):
-            jfif = jfif[:11] + struct.pack(">BHH", 1, *(round(d) for d in metadata.dpi)) + jfif[16:]
+        if metadata.resolution is not None and max(metadata.resolution) < 65535:
+            jfif = jfif[:11] + struct.pack(">BHH", 1, *(round(d) for d in metadata.resolution)) + jfif[16:]
     exif = bare_exif(metadata)
     segments = [_segment(0xE1, _EXIF_HEADER + exif)] if exif else []
     if metadata.xmp and len(metadata.xmp) + len(_XMP_HEADER) <= _MAX_SEGMENT:

@@ -42,8 +42,8 @@ def _metadata_chunks(metadata: Metadata) -> Iterator[bytes]:
     """ICCP, pHYs, eXIf and iTXt chunks, which stand between header and pixels."""
     if metadata.icc_profile:
         yield png_chunk(b"iCCP", b"ICC profile\0\0" + zlib.compress(metadata.icc_profile, 9))
-    if metadata.dpi is not None and all(0 < d < 1e6 for d in metadata.dpi):
-        yield png_chunk(b"pHYs", struct.pack(">IIB", *(round(d / _METRES_PER_INCH) for d in metadata.dpi), 1))
+    if metadata.resolution is not None:
+        yield png_chunk(b"pHYs", struct.pack(">IIB", *(round(d / _METRES_PER_INCH) for d in metadata.resolution), 1))
     if exif := bare_exif(metadata):
         yield png_chunk(b"eXIf", exif)
     if metadata.xmp:

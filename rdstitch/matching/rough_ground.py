@@ -72,4 +72,7 @@ def _fitted(pair: PairRegistration, inliers: BoolArray) -> PairRegistration:
     seen = np.isfinite(flat1).all(axis=1) & np.isfinite(flat2).all(axis=1)
     homography = direct_linear(flat1[seen], flat2[seen])
     homography /= np.cbrt(np.linalg.det(homography))
-    return replace(pair, relation=replace(relation, homography=homography, inliers=inliers))
+    moved = relation.reexpressed(homography, relation.camera, relation.camera2)
+    errors = np.linalg.norm(moved.transfer(matched.points1[inliers]) - matched.points2[inliers], axis=1)
+    rms, reason = float(np.sqrt(np.nanmean(errors**2))), "the ground is no plane: the homography that fits it best"
+    return replace(pair, relation=replace(moved, inliers=inliers, model="homography", rms=rms, reason=reason))

@@ -123,7 +123,7 @@ class EstimationTask(NamedTuple):
     def pair_matches(self) -> PairMatches:
         """As estimation takes them."""
         putative, camera = self.matches.load(), self.camera1
-        first = replace(camera.without_lens(), focal=camera.focal, focal_source=camera.focal_source).with_focal()
+        first = camera.without_lens().with_focal(camera.focal, camera.focal_source or "guess", camera.focal_std)
         known = None if self.tilt1 is None or self.tilt2 is None else np.array([self.tilt1, self.tilt2])
         second = replace(first.resized(self.camera2.image_size), center=self.camera2.center)
         return PairMatches(putative.points1, putative.points2, first, second, -putative.ratio, known)

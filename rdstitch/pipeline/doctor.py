@@ -233,13 +233,17 @@ def _sharpness_and_exposure(image: DecodedImage) -> tuple[float, float, float]:
     Sharpness is the contrast of the finest detail over that of twice as coarse detail; an image without detail has 0.
     """
     samples = image.pixels
-    full = float(np.iinfo(samples.dtype).max) if samples.dtype.kind == "u" else float(max(samples.max(), 1e-12))
+    whole = samples.dtype.kind == "u"
+    full = float(np.iinfo(samples.dtype).max if whole else samples.max(where=np.isfinite(samples), initial=1e-12))
     grey = samples if samples.ndim == 2 else samples[..., : min(3, samples.shape[2])].mean(axis=2)
     grey = np.ascontiguousarray(grey, dtype=np.float32) / np.float32(full)
-    seen = np.ones(grey.shape, dtype=bool) if image.alpha is None else image.alpha > 0
+    measured = np.isfinite(grey)
+    seen = measured if image.alpha is None else measured & (image.alpha > 0)
     if not seen.any():
         return 0.0, 0.0, 0.0
-    coarse = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    grey[~measured] = grey[seen].mean()
+    height, width = (max(1, round(side / 2)) for side in grey.shape)
+    coarse = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
     fine = float(np.abs(cv2.Laplacian(grey, cv2.CV_32F))[seen].mean())
     rough = float(np.abs(cv2.Laplacian(coarse, cv2.CV_32F)).mean())
     burnt = grey >= np.float32(254 / 255)

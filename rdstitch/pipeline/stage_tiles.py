@@ -287,7 +287,7 @@ def _grid(
     elif options.positions is not None:
         lines = dict(zip(listed, frame_numbers(listed), strict=True))
         numbers = [lines[source.frame] for source in sources if source.frame is not None]
-        grid = grid_from_arrays(options.positions, numbers, size, pixel_size)
+        grid = grid_from_arrays(options.positions, numbers, size, pixel_size, list(lines.values()))
     else:
         known = [stored.get(source.path) or StoredTile(source.path, {}) for source in sources]
         grid = grid_from_tiles(known, size, options.pixel_size)

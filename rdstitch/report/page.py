@@ -13,13 +13,14 @@ from rdstitch.report.mosaic import mosaic_section
 from rdstitch.report.pairs import match_graph, matched, residual_map
 from rdstitch.report.stage import stage_section
 from rdstitch.report.svg import Content, Markup, element, joined, of_source, section, table
-from rdstitch.results.messages import of_severity
+from rdstitch.results.messages import merge_by_reason, of_severity
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs
 
 _THUMBNAIL = 200  # pixels of the longer side
 _MAX_ROWS = 20
+_MAX_THUMBNAILS = 40
 _VIEWPORT = "width=device-width, initial-scale=1"
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 960px; margin: 2em auto; padding: 0 1em; }
@@ -157,12 +158,14 @@ def _left_out(registration: Registration) -> str:
         return element("p", "Every image is in the result.")
     sources = {str(source.path): source for source in registration.sources}
     shown = []
-    for message in registration.left_out:
+    for message in registration.left_out[:_MAX_THUMBNAILS]:
         source = sources.get(message.images[0])
         image = None if source is None else of_source(source, _THUMBNAIL)
         drawn = "" if image is None else element("img", src=image, alt="")
         shown.append(element("figure", drawn, element("figcaption", f"{message.images[0]}: {message.text}")))
-    return joined(element("h3", "Left out"), element("div", shown, class_="thumbnails"))
+    others = merge_by_reason(registration.left_out[_MAX_THUMBNAILS:])
+    more = element("p", f"And without a picture: {'; '.join(map(str, others))}.") if others else ""
+    return joined(element("h3", "Left out"), element("div", shown, class_="thumbnails"), more)
 
 
 def _lambda(registration: Registration) -> str:

@@ -33,6 +33,7 @@ _GRAPH_SIDE, _GRAPH_MARGIN = 900.0, 20.0
 _MAX_NAMES = 12  # images whose names are written
 _IMAGE_WIDTH, _IMAGE_GAP = 440.0, 10.0
 _MAX_LINES = 150
+_MAX_LINKS = 2000  # lines of the match graph
 _FADED = 0.6  # opacity of the images, so that lines can be seen on them
 _MAP_WIDTH, _COLUMNS = 640.0, 16
 _MIN_MATCHES = 4  # matches in a cell that make a mean
@@ -55,7 +56,8 @@ def match_graph(registration: Registration) -> str:
         for outline in outlines.values()
     ]
     links = [fit for fit in alignment.links if fit.used]
-    for fit in sorted(links, key=lambda fit: fit.rms):
+    by_error = sorted(links, key=lambda fit: fit.rms)
+    for fit in (by_error[k] for k in evenly_spaced(len(links), _MAX_LINKS)):
         share = float(np.nan_to_num(np.clip(fit.rms / alignment.rms - 0.75, 0.0, 1.0)))
         names = " and ".join(registration.sources[k].name for k in (fit.image1, fit.image2))
         title = element("title", f"{names}: {fit.inliers} of {fit.count} matches, {fit.rms:.2f} pixels")
@@ -68,11 +70,11 @@ def match_graph(registration: Registration) -> str:
         parts.append(element("circle", element("title", name), cx=x, cy=y, r=4, fill=fill))
         if len(used) <= _MAX_NAMES:
             parts.append(label(x + 6, y - 6, name, font_size=10))
+    omitted = f", of which {_MAX_LINKS} of all errors are drawn," if len(links) > _MAX_LINKS else ""
     return section(
         "Match graph",
-        f"{counted(len(links), 'pair')} over the outlines of {counted(len(used), 'image')}. Thicker lines have more "
-        "matches; green ones "
-        "fit the result well, red ones badly. The red dot is the reference image.",
+        f"{counted(len(links), 'pair')}{omitted} over the outlines of {counted(len(used), 'image')}. Thicker lines "
+        "have more matches; green ones fit the result well, red ones badly. The red dot is the reference image.",
         drawing(width, height, parts, "match graph"),
     )
 

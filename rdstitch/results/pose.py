@@ -64,13 +64,17 @@ class Pose:
     @property
     def unit(self) -> float:
         """How long the height of the first keyframe is: as given, else as odometry says, else one."""
-        return self.poses.height or (self.tracked.unit if math.isfinite(self.tracked.unit) else 1.0)
+        return self.tracked.unit if self._by_odometry else self.poses.height or 1.0
+
+    @property
+    def _by_odometry(self) -> bool:
+        """Whether odometry says how long the unit is."""
+        return not self.poses.height and math.isfinite(self.tracked.unit)
 
     @property
     def length_std(self) -> float:
         """Relative standard deviation that all lengths share, by the focal length; NaN where it is not known."""
-        by_odometry = not self.poses.height and math.isfinite(self.tracked.unit)
-        return self.tracked.unit_std if by_odometry else self.tracked.length_std
+        return self.tracked.unit_std if self._by_odometry else self.tracked.length_std
 
     @property
     def position(self) -> tuple[float, float, float] | None:
@@ -105,7 +109,9 @@ class Pose:
         """In the axes of the first image."""
         if (pose := self.tracked.pose) is None or self.tracked.covariance is None:
             return None
-        place, unit = np.array([pose.x, pose.y, 0.0, 0.0]), np.array([self.unit] * 3 + [1.0])
+        # A height that is given, and is the unit, is exact.
+        height = pose.height if self._by_odometry else 0.0
+        place, unit = np.array([pose.x, pose.y, height, 0.0]), np.array([self.unit] * 3 + [1.0])
         shared = 0.0 if math.isnan(self.length_std) else self.length_std
         return np.asarray((self.tracked.covariance + shared**2 * np.outer(place, place)) * np.outer(unit, unit))
 

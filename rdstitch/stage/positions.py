@@ -13,7 +13,9 @@ from numpy.typing import ArrayLike
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Origin, ScanOrder
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.inputs.tables import by_image, csv_rows, image_name
+from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.rows_of_images import RowsByImage
+from rdstitch.inputs.tables import Row, csv_rows
 from rdstitch.io.stored_tiles import StoredTile
 from rdstitch.stage.grid import TileGrid
 from rdstitch.system.file_access import read_text
@@ -118,40 +120,30 @@ def grid_from_table(
     names: Sequence[str], file: str | Path, size: tuple[int, int], pixel_size: float | None
 ) -> TileGrid:
     """Places by a CSV file with ``name``, ``x`` and ``y``, or ``x_um`` and ``y_um``, or by Fiji's list, in pixels."""
-    text, unit = read_text(file), None
-    table = _fiji_places(text, file)
-    if not table:
-        rows = by_image(csv_rows(text, str(file), _COLUMNS, ("name,x,y", "name,x_um,y_um")))
-        pixels = any("x" in row.values for row in rows.values())
-        x, y, unit = ("x", "y", None) if pixels else ("x_um", "y_um", 1.0)
-        table = {name: (row.needed(x), row.needed(y)) for name, row in rows.items()}
-    missing = [item for item in names if image_name(item) not in table]
-    if missing:
-        raise InputError(f"{file}: has no line for {missing[0]}; add one with its place")
-    places = np.array([table[image_name(item)] for item in names])
-    return _grid(places, unit, size, pixel_size, Path(file).name)
+    text = read_text(file)
+    rows = _fiji_rows(text, file) or csv_rows(text, str(file), _COLUMNS, ("name,x,y", "name,x_um,y_um"))
+    x, y, unit = ("x", "y", None) if any("x" in row.values for row in rows) else ("x_um", "y_um", 1.0)
+    places = []
+    for name, row in zip(names, RowsByImage(rows).of([Frame(Path(name), label=name) for name in names]), strict=True):
+        if row is None:
+            raise InputError(f"{file}: has no line for {name}; add one with its place")
+        places.append((row.needed(x), row.needed(y)))
+    return _grid(np.array(places), unit, size, pixel_size, Path(file).name)
 
 
-def _fiji_places(text: str, file: str | Path) -> dict[str, tuple[float, float]]:
+def _fiji_rows(text: str, file: str | Path) -> list[Row]:
     """What Fiji's list of tiles says; nothing of other texts."""
-    table: dict[str, tuple[float, float]] = {}
-    for number, line in enumerate(text.splitlines(), start=1):
-        if (found := _FIJI.fullmatch(line)) is None:
-            continue
-        name = image_name(found["name"])
-        if name in table:
-            raise InputError(f"{file}: line {number}: {name} is here twice; remove one")
-        try:
-            table[name] = float(found["x"]), float(found["y"])
-        except ValueError:
-            raise InputError(f"{file}: line {number} has no numbers for x and y") from None
-    return table
+    lines = enumerate(map(_FIJI.fullmatch, text.splitlines()), start=1)
+    return [Row(f"{file}: line {number}", found.groupdict(), ".") for number, found in lines if found is not None]
 
 
 def grid_from_arrays(
-    positions: Any, numbers: Sequence[int], size: tuple[int, int], pixel_size: float | None
+    positions: Any, numbers: Sequence[int], size: tuple[int, int], pixel_size: float | None, listed: Sequence[int]
 ) -> TileGrid:
-    """Places of tiles by their numbers in an array (N, 2), pixels, or in the columns x and y, or x_um and y_um."""
+    """Places of tiles by their numbers in an array (N, 2), pixels, or in the columns x and y, or x_um and y_um.
+
+    There is one for each number in ``listed``, of tiles too that cannot be read; for frames of videos others between.
+    """
     unit = None
     places: FloatArray = np.empty(0)
     if isinstance(positions, Mapping) or hasattr(positions, "columns"):
@@ -162,8 +154,10 @@ def grid_from_arrays(
         positions = zip(*(positions[name] for name in pair), strict=True)
     with suppress(TypeError, ValueError):  # of what is no array of numbers
         places = np.asarray(list(positions), dtype=np.float64)
-    if places.ndim != 2 or places.shape[1] != 2 or len(places) <= max(numbers):
-        raise ArgumentError(f"positions must be numbers, x and y of each of {max(numbers) + 1} tiles")
+    count = max(listed) + 1
+    allowed = len(places) == count or len(places) > count > len(listed)
+    if places.ndim != 2 or places.shape[1] != 2 or not allowed:
+        raise ArgumentError(f"positions must be numbers, x and y of each of {count} tiles")
     return _grid(places[list(numbers)], unit, size, pixel_size, "positions")
 
 

@@ -149,6 +149,8 @@ class Cache:
         """
         with suppress(OSError):
             data = pack((_entry_name(file), value))
+            if len(data) > _MAX_ENTRY:  # which nobody would read
+                return False
             if self.temporary is None:
                 _write_at_once(file, data)
             else:

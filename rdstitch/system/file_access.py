@@ -54,6 +54,11 @@ def is_url(path: str | Path) -> bool:
     return _SCHEME.match(str(path).rpartition(_SEVERAL)[2]) is not None
 
 
+def without_query(path: Path) -> Path:
+    """The path of a URL without what follows a question mark, such as a signature; any other as it is."""
+    return Path(str(path).partition("?")[0]) if is_url(path) else path
+
+
 def url_of(path: str | Path) -> str:
     """The URL that a path was made of."""
     chain = []

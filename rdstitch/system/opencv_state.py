@@ -4,7 +4,7 @@ import selectors
 import sys
 import threading
 from collections.abc import Iterator
-from concurrent.futures.thread import _worker
+from concurrent.futures import thread
 from contextlib import contextmanager
 from typing import Any
 
@@ -14,7 +14,9 @@ _SILENT = 0  # the log level of that name
 # OpenCV 4 has the same functions at its top level; its stubs know neither.
 _logging: Any = getattr(cv2.utils, "logging", cv2)
 # Functions that do nothing but wait: those of events, conditions and queues, of event loops, and of idle pools.
-_WAITING = {threading.Condition.wait.__code__, selectors.DefaultSelector.select.__code__, _worker.__code__}
+_WAITING = {threading.Condition.wait.__code__, selectors.DefaultSelector.select.__code__}
+# That of idle pools has a private name; where it has another one, a pool that was begun meanwhile counts as busy.
+_WAITING |= {worker.__code__ for worker in (getattr(thread, "_worker", None),) if worker is not None}
 _lock = threading.Lock()
 _silenced: list[int] = []  # the log level before each of the blocks that hold it
 

@@ -206,6 +206,7 @@ class _Item(NamedTuple):
     place: Path
     staged: Path
     is_folder: bool
+    check: Callable[[Path], None] | None  # refuses to replace a folder that is something else
 
 
 class Outputs:
@@ -254,14 +255,17 @@ class Outputs:
         self._made[:0] = missing
 
     @contextmanager
-    def writing(self, path: str | Path, *, is_folder: bool = False) -> Iterator[Path]:
-        """Stage a file, or a folder of Deep Zoom tiles or chunks; a failure of the file system is one of ``path``.
+    def writing(
+        self, path: str | Path, *, is_folder: bool = False, check: Callable[[Path], None] | None = None
+    ) -> Iterator[Path]:
+        """Stage a file, or a folder; a failure of the file system is one of ``path``.
 
-        Yields where to write the file, or the empty folder.
+        Yields where to write the file, or the empty folder. ``check`` refuses to replace a folder that is there, which
+        must otherwise hold Deep Zoom tiles or chunks.
         """
         name = Path(path)
         with naming(name), self.together():
-            staged = self._stage(name, is_folder=is_folder)
+            staged = self._stage(name, is_folder, check)
             if is_folder:
                 staged.mkdir()
             yield staged
@@ -301,7 +305,7 @@ class Outputs:
         """Give where an output lies until it is in its place; None where none of this name is staged."""
         return next((item.staged for item in self._items if item.name == Path(path)), None)
 
-    def _stage(self, name: Path, *, is_folder: bool) -> Path:
+    def _stage(self, name: Path, is_folder: bool, check: Callable[[Path], None] | None) -> Path:
         place = Path(os.path.realpath(name.parent)) / name.name
         if place.is_symlink():
             place = Path(os.path.realpath(place))
@@ -309,11 +313,11 @@ class Outputs:
             raise OutputError(f"{name}: is the name of two outputs; choose another one for each")
         if place.parent not in self._folders:
             self._folders[place.parent] = TemporaryFolder(place.parent, ".rdstitch-")
-        is_tiles = is_folder and not is_zarr(name)
+        is_tiles = is_folder and check is None and not is_zarr(name)
         # Tiles are staged just before their description, and are found beside it by its name.
         staged = self._folders[place.parent].path / f"new{self._number}{'_files' if is_tiles else name.suffix}"
         self._number += not is_tiles
-        self._items.append(_Item(name, place, staged, is_folder))
+        self._items.append(_Item(name, place, staged, is_folder, check))
         return staged
 
     def _check(self, item: _Item) -> None:
@@ -324,6 +328,8 @@ class Outputs:
             raise _appeared(item.name)
         if not item.is_folder:
             item.staged.chmod(item.place.stat().st_mode & 0o777)
+        elif item.check is not None:
+            item.check(item.place)
         elif is_zarr(item.place):
             check_folder(item.place, overwrite=True)
         elif not holds_only_tiles(item.place):

@@ -62,7 +62,7 @@ def test_background_is_what_no_image_covers(rdstitch: Run, sidecar: Path, frames
 
 def test_amounts_of_memory() -> None:
     option = next(option for option in cli.load_all()["pano"].params if option.name == "max_memory")
-    amounts = {"800M": 800 * 2**20, "2G": 2**31, "1.5 GiB": 3 * 2**29, "64k": 65536, "12345": 12345}
+    amounts = {"800M": 800 * 2**20, "2G": 2**31, "1.5 GiB": 3 * 2**29, "2048k": 2**21, "1234567": 1234567}
     assert {text: option.type.convert(text, None, None) for text in amounts} == amounts
 
 

@@ -38,10 +38,14 @@ def test_faults_are_found(frames: list[Path], stranger: Path, tmp_path: Path) ->
     cv2.imwrite(str(tmp_path / "burnt.png"), np.minimum(sharp * 3.0, 255).astype(np.uint8))
     cv2.imwrite(str(tmp_path / "dark.png"), sharp // 20)
     (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8 no image")
+    cv2.imwrite(str(tmp_path / "dot.png"), np.full((1, 1, 3), 99, np.uint8))
+    holes = cv2.cvtColor(sharp, cv2.COLOR_BGR2GRAY).astype(np.float32) / 255
+    holes[:50] = np.nan
+    cv2.imwrite(str(tmp_path / "holes.tif"), holes)
     found = examine(tmp_path)
-    assert found.images == 7
+    assert found.images == 9
     assert len(found.unreadable) == 1
-    assert found.blurred == ("blurred.png",)
+    assert found.blurred == ("blurred.png", "dot.png")  # that has no detail
     assert found.burnt == ("burnt.png",)
     assert found.dark == ("dark.png",)
     assert "stranger.png" in found.alone

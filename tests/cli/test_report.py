@@ -26,7 +26,7 @@ from rdstitch.report import mosaic as report
 from rdstitch.report import report_page, write_report
 from rdstitch.report.mosaic import seam_dots
 from rdstitch.report.pairs import matched
-from rdstitch.results.messages import Message
+from rdstitch.results.messages import Message, left_out
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.verification.findings import Finding, Kind
@@ -139,6 +139,19 @@ def test_the_numbers_are_those_of_the_result(pair: StitchResult) -> None:
     # Outlines and the pair over them; nothing is drawn twice.
     graph = report_page(pair).split("<h2>Match graph</h2>")[1].split("</section>")[0]
     assert (graph.count("<path"), graph.count("<line"), graph.count("<circle")) == (2, 1, 2)
+
+
+def test_what_is_many_is_not_all_shown(pair: StitchResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rdstitch.report.page._MAX_THUMBNAILS", 1)
+    monkeypatch.setattr("rdstitch.report.pairs._MAX_LINKS", 1)
+    registration, names = pair.registration, [str(source.path) for source in pair.registration.sources]
+    (fit,) = registration.alignment.links
+    many = replace(registration, alignment=replace(registration.alignment, links=(fit, fit)))
+    page = report_page(many.with_messages([left_out(name, "is alike") for name in names]))
+    assert "2 pairs, of which 1 of all errors are drawn, over" in page
+    graph, listed = (page.split(f"<h2>{title}")[1].split("</section>")[0] for title in ("Match graph", "Warnings"))
+    assert (graph.count("<line"), listed.count("<img")) == (1, 1)
+    assert f"without a picture: left out {names[1]}: is alike" in listed
 
 
 def test_what_its_seams_refuse_is_shown(

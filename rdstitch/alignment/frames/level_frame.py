@@ -16,6 +16,8 @@ _ROLL = np.radians(3.0)  # standard deviation of the roll of a camera that is he
 _STEEP = np.cos(np.radians(30.0))
 """Images that look within 30 degrees of straight up or down do not show how the camera was held."""
 
+_VERTICAL = 1e-6  # radians from straight up or down at which an image shows no heading
+
 
 def levelled(matrices: FloatArray, reference: int, gravity: FloatArray | None = None) -> FloatArray:
     """Matrices (N, 3, 3) from undistorted coordinates of each image to directions in a level frame.
@@ -64,7 +66,10 @@ def level_frame(rotations: FloatArray, reference: int, down_by_gravity: FloatArr
     certainty = (spread[1] - spread[0]) / max(spread[1] + spread[0], 1e-12)
     certainty *= -math.expm1(-spread[1] / (2.0 * len(right) * _ROLL**2))  # that roll alone spreads them less (Rayleigh)
     y = _unit(certainty * axis + (1.0 - certainty) * mean_down) if down_by_gravity is None else down_by_gravity
-    x = _unit(np.cross(y, ahead[reference]))
+    x = np.cross(y, ahead[reference])
+    if np.linalg.norm(x) < _VERTICAL:
+        x = right[reference] - (right[reference] @ y) * y
+    x = _unit(x)
     z = np.cross(x, y)
     heading = _middle(np.arctan2(ahead @ x, ahead @ z))
     x, z = np.cos(heading) * x - np.sin(heading) * z, np.sin(heading) * x + np.cos(heading) * z

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from importlib import import_module
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -18,8 +19,8 @@ from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import Alignment, PlanarPoses, Unused
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.alignment.unaligned import explain_unaligned
-from rdstitch.choices import Purpose
-from rdstitch.errors import ArgumentError, RegistrationError
+from rdstitch.choices import LensName, ModelName, Purpose
+from rdstitch.errors import ArgumentError, RdstitchError, RegistrationError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import PlanarMotion
 from rdstitch.geometry.radial_homography import RadialHomography, transfer
@@ -62,6 +63,33 @@ def _wrong_link(given: Scene, i: int, j: int, rng: np.random.Generator) -> Link:
     p, q = p[inside][:100], q[inside][:100] + rng.normal(0, 0.3, (100, 2))
     relation = RadialHomography(h, camera, camera, np.ones(100, dtype=np.bool_), distortion_std=0.01, rms=0.4)
     return Link(i, j, p, q, relation)
+
+
+_OPTIONS: list[dict[str, object]] = [
+    {"tilt": (0.05, -0.03)},
+    {"attitudes": np.zeros((4, 2))},
+    {"attitudes": np.zeros((4, 2)), "attitudes_std": 0.01},
+    {"gravity": np.tile([0.0, 0.0, 1.0], (4, 1))},
+    {"positions": np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 2.0], [3.0, 2.0]]), "positions_std": np.ones(4)},
+    {"lens_known": True},
+    {"reference": 3},
+    {"pose_covariance": True},
+    *[dict[str, object](lens=lens) for lens in get_args(LensName)],
+    *[dict[str, object](purpose=purpose) for purpose in Purpose],
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", get_args(ModelName))
+def test_every_model_goes_with_every_option_or_says_why_not(model: str) -> None:
+    given = scene(grid(2, 2, (0.4, 0.3), 0.2, np.random.default_rng(1)), rng=np.random.default_rng(1), per_link=40)
+    for options in _OPTIONS:
+        try:
+            found = aligned(given, model=model, **options)
+        except RdstitchError:
+            continue
+        assert np.isfinite(found.homographies).all(), options
+        assert (np.abs(np.linalg.det(found.homographies)) > 1e-6).all(), options
 
 
 @pytest.mark.parametrize(
@@ -315,6 +343,9 @@ def test_mistakes_of_the_caller() -> None:
         align(given.cameras, [given.links[0], given.links[0]])
     with pytest.raises(ArgumentError, match="outside of the 1"):
         align(given.cameras[:1], given.links)
+    lenses = [Camera((640, 480), -0.25), Camera((640, 480))]
+    with pytest.raises(ArgumentError, match="lenses that differ"):
+        align(lenses, given.links, AlignmentOptions(lens_known=True))
     with pytest.raises(ArgumentError, match="model must be"):
         AlignmentOptions(model="affine")
     with pytest.raises(ArgumentError, match="with itself"):

@@ -94,6 +94,12 @@ def test_a_tilt_of_the_wrong_sign_is_not_used(tilt: tuple[float, float], right: 
     assert right or "they show 2.8" in found.messages[0].text
 
 
+def test_a_turn_that_was_asked_for_is_taken_beside_a_given_tilt() -> None:
+    rng = np.random.default_rng(5)
+    given = scene(grid(2, 2, (0.4, 0.3), 0.2, rng), rng=rng, per_link=40)
+    assert aligned(given, model="rotation", tilt=(0.05, -0.03)).model == "rotation"
+
+
 @pytest.mark.parametrize(
     ("factor", "right", "tilt_given"), [(1.15, False, False), (0.85, False, True), (1.01, True, False)]
 )

@@ -87,6 +87,15 @@ def test_neither_a_roll_of_hands_nor_a_camera_on_its_side_tips_the_horizon() -> 
     np.testing.assert_allclose(ahead, (0.0, 0.0, 1.0), atol=1e-9)
 
 
+def test_an_image_that_looks_straight_down_or_up_has_a_level_frame() -> None:
+    rotations = camera_rotations([0.0, 0.3], [0.0, 0.2])
+    for down in (rotations[0, 2], -rotations[0, 2]):
+        frame = level_frame(rotations, 0, down)
+        np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(frame) == pytest.approx(1.0)
+        np.testing.assert_allclose(frame[1], down, atol=1e-12)
+
+
 def test_gravity_that_contradicts_itself_levels_nothing_in_any_unit() -> None:
     turns = rotation_from_vector(np.array([[0.0, 0.0, 0.0], [0.0, 0.2, 0.0], [0.0, 0.4, 0.0]]))
     down = np.array([[0.0, 1.0, 0.0], [0.0, 1.0, 0.0], [np.nan] * 3])

@@ -579,3 +579,66 @@ def test_a_lens_of_any_sign_keeps_its_scale_at_the_unit_radius(distortion: float
 def test_a_format_needs_no_name(camera_format: CameraFormat, tmp_path: Path) -> None:
     save_camera(CAMERAS[0], tmp_path / "lens", camera_format)
     assert load_camera(tmp_path / "lens").distortion == pytest.approx(CAMERAS[0].distortion, abs=0.01)
+
+
+BROWN = [-0.2, 0.03, 0.003, 0.002], [-0.2, 0.03, 0.003, 0.002, 0.01], [-0.2, 0.05, 0, 0, 0.01, 0.02, 0.003, 0.001]
+
+
+@pytest.mark.parametrize("coefficients", BROWN)
+@pytest.mark.parametrize(
+    ("name", "parse"),
+    [
+        ("c.yml", _opencv),
+        ("fisheye.yml", _opencv),
+        ("cameras.json", _opendronemap),
+        ("camera_info.yaml", _opencv),
+        ("camchain.yaml", _camera_chain),
+        ("cameras.txt", _colmap),
+    ],
+)
+def test_a_calibration_is_written_with_all_that_the_format_has(
+    tmp_path: Path, coefficients: list[float], name: str, parse: Callable[[str], Parsed]
+) -> None:
+    fy = 1010.0
+    camera = load_camera(_opencv_file(tmp_path / "given.yml", (1000.0, fy), coefficients, (1280, 960)))
+    save_camera(camera, tmp_path / name)
+    text = (tmp_path / name).read_text(encoding="utf-8")
+    (fx, written_fy, cx, cy), values, model = parse(text)
+    fisheye = model in ("equi", "equidistant", "OPENCV_FISHEYE")
+    points = _points(camera)
+    straight = (camera.lens_model or camera).undistort(points)
+    rays = np.column_stack([(straight - camera.center) / np.sqrt(1000.0 * fy), np.ones(len(points))])
+    matrices = [
+        np.array([[a, 0, c], [0, b, d], [0, 0, 1.0]]) for a, b, c, d in ((1000, fy, 641, 478), (fx, written_fy, cx, cy))
+    ]
+    given = _projected(matrices[0], coefficients, rays, fisheye=False)
+    apart = np.linalg.norm(_projected(matrices[1], values, rays, fisheye=fisheye) - given, axis=1).max()
+    assert apart < 1.05 * _stated(text) + 1e-6
+    if len(coefficients) <= {"camchain.yaml": 4, "fisheye.yml": 0, "cameras.json": 5}.get(name, 8):
+        assert apart < 1e-9
+    assert load_camera(tmp_path / name) == camera
+
+
+@pytest.mark.parametrize("coefficients", BROWN)
+@pytest.mark.parametrize("name", ["c.pto", "a.xml"])
+def test_a_radial_format_states_what_it_cannot_hold(tmp_path: Path, coefficients: list[float], name: str) -> None:
+    camera = load_camera(_opencv_file(tmp_path / "given.yml", (1000.0, 1010.0), coefficients, (1280, 960)))
+    (note,) = export_note(camera, tmp_path / name)
+    (stated,) = re.findall(r"at most (\d+\.\d+) pixels", note)
+    assert float(stated) > 2.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("size", [(640, 480), (4000, 3000)])
+def test_round_coefficients_come_back(tmp_path: Path, name: str, size: tuple[int, int]) -> None:
+    for distortion in (-0.8, -0.25, -0.05, 0.01, 1e-5, 1e-16):
+        camera = Camera(size, distortion)
+        save_camera(camera, tmp_path / name)
+        assert load_camera(tmp_path / name) == camera
+
+
+def test_numbers_without_a_dot_are_read_from_older_files(tmp_path: Path) -> None:
+    save_camera(Camera((4000, 3000), -0.05), tmp_path / "c.yml")
+    text = (tmp_path / "c.yml").read_text(encoding="utf-8")
+    (tmp_path / "c.yml").write_text(re.sub(r"lambda_px: .*", "lambda_px: -8e-09", text), encoding="utf-8")
+    assert load_camera(tmp_path / "c.yml") == Camera((4000, 3000), -0.05)

@@ -1,5 +1,6 @@
 """Finding the inputs, and choosing among them."""
 
+import re
 from pathlib import Path
 
 import cv2
@@ -68,6 +69,24 @@ def test_a_video_among_images_is_used_only_when_asked_for(tmp_path: Path) -> Non
     assert len(find_images([clip], frames_folder=folder).frames) > 0
     with pytest.raises(InputError, match=r"clip\.avi: is a video beside one image"):
         find_images([clip, paths[0]], frames_folder=folder)
+
+
+def test_a_video_that_was_cut_off_is_told(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (40, 48, 64, 3), dtype=np.uint8)
+    clip = write_video(tmp_path / "whole.avi", noise)
+    (tmp_path / "cut.avi").write_bytes(clip.read_bytes()[: clip.stat().st_size // 2])
+    for name, texts in (("whole", []), ("cut", ["ends after N of 40 frames; copy it again from its source"])):
+        found = find_images([tmp_path / f"{name}.avi"], frames_folder=lambda: tmp_path, every=3)
+        assert [re.sub(r"after \d+", "after N", message.text) for message in found.messages] == texts
+        assert (len(found.frames) == 14) == (not texts)
+
+
+@pytest.mark.parametrize("name", ["", "@"])
+def test_an_empty_name_is_not_the_current_folder(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    images(tmp_path, 2)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="one of the names of images is empty" if not name else "cannot be read"):
+        find_images([name])
 
 
 def test_videos_of_one_name_are_filed_apart(tmp_path: Path) -> None:

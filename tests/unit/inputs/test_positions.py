@@ -7,16 +7,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
 from rdstitch.geometry.places import GpsPosition
+from rdstitch.inputs.attitudes import with_attitudes
+from rdstitch.inputs.find import find_images
 from rdstitch.inputs.ground_control import with_ground_control
 from rdstitch.inputs.measurements import positions_of
 from rdstitch.inputs.positions import with_positions
-from rdstitch.inputs.source import Source
+from rdstitch.inputs.source import Source, read_sources
+from rdstitch.inputs.times import timestamps_of, with_times
 from rdstitch.io.metadata import Metadata
+from rdstitch.stage.positions import grid_from_table
 
 
 def _source(gps: GpsPosition | None) -> Source:
@@ -292,3 +297,31 @@ def test_letters_of_degrees_count_wherever_they_stand(tmp_path: Path, west: str)
     (tmp_path / "p.csv").write_text(f'name,lat,lon\na.jpg,46.5S,"{quoted}"\n', encoding="utf-8")
     place = with_positions(_sources(), tmp_path / "p.csv")[0].metadata.gps
     assert (place.latitude, place.longitude) == pytest.approx((-46.5, -6.6))
+
+
+def test_every_kind_of_table_tells_images_of_one_name_in_two_folders(tmp_path: Path) -> None:
+    for folder in ("100", "101"):
+        (tmp_path / folder).mkdir()
+        Image.new("L", (32, 24)).save(tmp_path / folder / "x y.png")
+    files = [tmp_path / folder / "x y.png" for folder in ("100", "101")]
+    texts = {
+        "positions": "SourceFile,lat,lon\n/card/101/x y.png,1,101\n/card/100/x y.png,1,100\n",
+        "attitudes": "name,psi,theta\n101/x y.png,1,0\n100/x y.png,2,0\n",
+        "times": "101 101/x y.png\n100 100/x y.png\n",
+        "control": "EPSG:32632\n500000 5000000 0 10 20 101/x y.png P 1\n500000 5000000 0 5 6 100/x y.png\n",
+        "places": "# Fiji\n100/x y.png; ; (1, 2)\n101/x y.png; ; (31, 2)\n",
+    }
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    sources, _ = read_sources(with_times(find_images(files).frames, tmp_path / "times"), skip_bad=False)
+    sources = with_attitudes(with_positions(sources, tmp_path / "positions"), tmp_path / "attitudes")
+    sources = with_ground_control(sources, tmp_path / "control")
+    assert [s.metadata.gps.longitude for s in sources] == [100, 101]
+    assert [s.attitude.tilt[0] for s in sources] == pytest.approx(np.radians([2.0, 1.0]))
+    assert timestamps_of(sources).tolist() == [100, 101]
+    assert [[(c.name, c.pixel) for c in s.control] for s in sources] == [
+        [("500000 5000000", (5.0, 6.0))],
+        [("P 1", (10.0, 20.0))],
+    ]
+    places = grid_from_table([source.name for source in sources], tmp_path / "places", (32, 24), None).places
+    assert (places[1] - places[0]).tolist() == [30, 0]

@@ -1,11 +1,15 @@
 """Tables as users have them: every notation of numbers, names of every kind, and what is refused."""
 
 import re
+from pathlib import Path
 
 import pytest
 
 from rdstitch.errors import InputError
-from rdstitch.inputs.tables import Row, by_image, csv_rows, json_rows, listed_rows
+from rdstitch.inputs.find import find_images
+from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.rows_of_images import RowsByImage
+from rdstitch.inputs.tables import Row, csv_rows, json_rows, listed_rows
 
 COLUMNS = {"name": "name file image", "x": "x easting", "y": "y northing", "um": "xum"}
 
@@ -70,7 +74,43 @@ def test_headings_quotes_comments_and_paths() -> None:
 )
 def test_what_is_wrong_is_named(text: str, message: str) -> None:
     with pytest.raises(InputError, match=re.escape(message)):
-        [row.needed("x") for row in by_image(_rows(text)).values()]
+        [row.needed("x") for row in RowsByImage(_rows(text)).of([Frame(Path("a"))]) if row is not None]
+
+
+TWO = ["100/x.png", "101/x.png"]  # every drone begins its numbers anew in a new folder
+
+
+@pytest.mark.parametrize(
+    ("images", "rows", "found"),
+    [
+        (TWO, ["/data/100/x.png", "./101/x.png"], [0, 1]),
+        (TWO, ["F:\\DCIM\\101\\X.PNG", "100/x.png"], [1, 0]),
+        (TWO, ["101/x.png"], [None, 0]),
+        (TWO, ["102/x.png", "100/x.png"], [1, None]),
+        (TWO, ["x.png"], "x.png could be any of 100/x.png, 101/x.png; write it with its folder"),
+        (["1/left/x.png", "2/left/x.png"], ["left/x.png"], "could be any of"),
+        (["1/left/x.png", "2/left/x.png"], ["2/left/x.png", "left/y.png"], [None, 0]),
+        # One image, and a table of more, or of a folder that was moved.
+        (["101/x.png"], ["100/x.png", "101/x.png"], [1]),
+        (["101/x.png"], ["100/x.png"], [0]),
+        (["101/x.png"], ["100/x.png", "102/x.png"], "line 3: x.png is here twice; remove one"),
+        (["a/x.png", "a/X.png"], ["X.png", "x.png"], [1, 0]),
+        (["a/x.png", "a/../a/x.png"], ["x.png"], [0, 0]),
+    ],
+)
+def test_a_row_is_about_the_image_whose_path_ends_like_its_name(
+    tmp_path: Path, images: list[str], rows: list[str], found: list[int | None] | str
+) -> None:
+    for image in images:
+        (tmp_path / image).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / image).touch()
+    frames = find_images([tmp_path / image for image in images]).frames
+    table = RowsByImage(_rows("name,x,y\n" + "".join(f"{name},{k},0\n" for k, name in enumerate(rows))))
+    if isinstance(found, str):
+        with pytest.raises(InputError, match=re.escape(found)):
+            table.of(frames)
+    else:
+        assert [row and row.number("x") for row in table.of(frames)] == found
 
 
 def test_names_in_lists_hold_blanks() -> None:

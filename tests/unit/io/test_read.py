@@ -92,6 +92,18 @@ def test_every_mode_becomes_grey_or_rgb(tmp_path: Path, colours: Samples, mode: 
     assert decoded.pixels.dtype in (np.uint8, np.uint16, np.float32)
 
 
+@pytest.mark.parametrize("deep", [False, True])
+def test_a_grey_that_stands_for_nothing_is_transparent_and_counted(tmp_path: Path, deep: bool) -> None:
+    grey = np.arange(20 * 30).reshape(20, 30) * 100
+    image = Image.fromarray(grey.astype(np.uint16) if deep else (grey % 256).astype(np.uint8))
+    image.save(tmp_path / "a.png", transparency=300 if deep else 44)
+    decoded = read_image(tmp_path / "a.png")
+    assert decoded.pixels.ndim == 2
+    assert decoded.alpha is not None
+    assert ((decoded.alpha == 0) == (grey == 300 if deep else grey % 256 == 44)).all()
+    assert read_metadata(tmp_path / "a.png").channels == 2
+
+
 def test_the_header_knows_whether_there_are_colours(tmp_path: Path, colours: Samples) -> None:
     for mode, suffix in (
         ("L", "png"),
@@ -100,6 +112,7 @@ def test_the_header_knows_whether_there_are_colours(tmp_path: Path, colours: Sam
         ("P", "tif"),
         ("RGB", "jpg"),
         ("L", "jpg"),
+        ("CMYK", "jpg"),
         ("1", "tif"),
     ):
         for coloured in (True, False):

@@ -1,6 +1,8 @@
 """Writing images: whole or not at all, the same bytes for the same image, nothing lost."""
 
+import errno
 import itertools
+import os
 import re
 import shutil
 import subprocess
@@ -286,3 +288,29 @@ def test_padding_of_camera_names_is_not_copied(tmp_path: Path) -> None:
         assert (tags["Make"].value, tags["Model"].value) == ("Maker", "Camera 1")
     data = (tmp_path / "a.tif").read_bytes()
     assert b"Maker\0\0" not in data
+
+
+@pytest.mark.parametrize("dpi", [(4294967295 * 2.54,) * 2, (-72.0, -72.0), (1e-12, 72.0)])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
+def test_an_impossible_resolution_costs_no_image(tmp_path: Path, suffix: str, dpi: tuple[float, float]) -> None:
+    pixels = _image(30, 40, 3, np.uint8)
+    write_image(tmp_path / f"a.{suffix}", pixels, metadata=Metadata((40, 30), dpi=dpi))
+    assert read_image(tmp_path / f"a.{suffix}").pixels.shape == pixels.shape
+
+
+def test_a_disk_that_is_full_when_a_tiff_is_ordered_costs_the_order_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pixels = _image(700, 600, 3, np.uint8)
+    spec = ImageSpec((600, 700), 3, np.dtype(np.uint8), transparent=False, metadata=Metadata((600, 700)))
+
+    def full(*_: object) -> bytes:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("rdstitch.io.tiff_order._directory", full)
+        _, (message,) = write_strips(tmp_path / "a.tif", spec, [(pixels, None)])
+    assert "No space left on device" in message.text
+    assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
+    np.testing.assert_array_equal(read_image(tmp_path / "a.tif").pixels, pixels)
+    assert write_strips(tmp_path / "b.tif", spec, [(pixels, None)])[1] == []

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from examples.worlds.correspondences import stored
 from rdstitch.arrays import FloatArray
 from rdstitch.features import Correspondences, Features, match
 from rdstitch.geometry.camera import Camera
@@ -20,12 +21,18 @@ from rdstitch.matching.static_background import (
     moving_features,
     without_static_background,
 )
-from rdstitch.matching.two_view import PairRegistration
+from rdstitch.matching.two_view import EstimationTask, PairRegistration
 from rdstitch.robust import EstimationOptions
 from rdstitch.system.progress import silent
 
 LENS = Camera((640, 480), distortion=-0.2, focal=520.0)
 IMAGES = 4
+
+
+def test_a_pair_is_as_sure_of_the_focal_length_as_its_camera() -> None:
+    camera = Camera((640, 480), focal=500.0, focal_source="file", focal_std=75.0)
+    pair = EstimationTask(camera, camera, stored(np.zeros((9, 2)), np.zeros((9, 2))), None, None).pair_matches()
+    assert (pair.camera1.focal_log_std, pair.camera2.focal_log_std) == (0.15, 0.15)
 
 
 def _features(points: FloatArray, descriptors: FloatArray) -> Features:

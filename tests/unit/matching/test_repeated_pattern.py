@@ -32,6 +32,7 @@ def _pair(parallax: FloatArray, plane: BoolArray = PLANE) -> PairRegistration:
     points2 = POINTS + np.column_stack([parallax, np.zeros(300)])
     points2[~RIGHT] = np.random.default_rng(1).uniform((0.0, 0.0), (639.0, 479.0), (60, 2))
     relation = RadialHomography(np.eye(3), CAMERA, CAMERA, plane & RIGHT, distortion_std=0.01)
+    relation = replace(relation, model="rigid", rms=0.7, parameters=("distortion",), covariance=np.eye(1))
     return PairRegistration(0, 1, stored(POINTS, points2), relation)
 
 
@@ -41,10 +42,17 @@ def test_the_other_flank_of_a_valley_belongs_to_the_ground() -> None:
     rough, same = over_rough_ground([pair, failed], 3.0)
     assert same is failed
     relation = rough.relation
+    assert (relation.model, relation.motion, relation.parameters, relation.covariance.size) == (
+        "homography",
+        None,
+        (),
+        0,
+    )
     assert relation.inliers[RIGHT].mean() > 0.98
     assert relation.inliers[~RIGHT].mean() < 0.1
     matched = rough.correspondences
     errors = np.linalg.norm(relation.transfer(matched.points1) - matched.points2, axis=1)[RIGHT]
+    assert relation.rms == pytest.approx(np.sqrt(np.mean(errors[relation.inliers[RIGHT]] ** 2)), rel=0.05)
     assert np.sqrt(np.mean(errors**2)) < 8.0  # 31 pixels at the far side, by the plane of the near one
     assert (relation.distortion, relation.distortion_std) == (-0.2, 0.01)
     (again,) = over_rough_ground([rough], 3.0)

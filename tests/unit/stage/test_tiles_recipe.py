@@ -45,7 +45,7 @@ def test_arrays_of_any_library_with_positions() -> None:
     assert min(item.reads for item in lazy) > 0
 
 
-@pytest.mark.parametrize("places", [[[1, 2], [3]], [["a", "b"]] * 6, {"x": [1] * 6, "y": [1] * 5}])
+@pytest.mark.parametrize("places", [[[1, 2], [3]], [["a", "b"]] * 6, [[0, 0]] * 7, {"x": [1] * 6, "y": [1] * 5}])
 def test_positions_that_are_no_numbers_of_each_tile_are_refused(places: object) -> None:
     with pytest.raises(ArgumentError, match="numbers, x and y of each of 6 tiles"):
         rdstitch.tiles(TILES, positions=places)

@@ -306,3 +306,10 @@ def test_what_could_run_code_is_refused(value: Any) -> None:
     else:
         with pytest.raises(InputError, match="no result"):
             unpack(packed)
+
+
+def test_an_entry_that_nobody_would_read_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rdstitch.system.cache._MAX_ENTRY", 1000)
+    stored = Cache.at(tmp_path).stored("stage", (1,), lambda: np.zeros(1000))
+    assert stored.file is None
+    assert len(stored.load()) == 1000

@@ -138,3 +138,8 @@ def test_a_forked_process_does_not_wait_for_the_threads_of_its_parent(threads: s
     # It would wait for ever; the limit is for the test to end.
     done = subprocess.run([sys.executable, "-c", _IN_A_FORKED_CHILD, threads], timeout=120, check=False)
     assert done.returncode == 0
+
+
+def test_a_private_name_of_python_is_not_needed() -> None:
+    script = "import concurrent.futures.thread as t; del t._worker; import rdstitch.system.opencv_state"
+    subprocess.run([sys.executable, "-c", script], timeout=60, check=True)

@@ -350,6 +350,17 @@ def test_folder_and_pattern(flight: str) -> None:
     assert [frame.path.name for frame in find_images([f"{flight}/f?.*"]).frames] == ["f2.tif", "f9.jpg"]
 
 
+def test_what_signs_an_address_is_no_pattern_and_no_name(flight: str) -> None:
+    system, signature = fsspec.filesystem("memory"), "?X-Amz-Credential=a/b&X-Amz-Signature=[1]*"
+    for name in ("/flight/f9.jpg", "/other/f9.jpg"):
+        system.pipe(name + signature, system.cat("/flight/f9.jpg"))
+    frames = find_images(
+        [f"{flight}/f9.jpg{signature}", f"memory://other/f9.jpg{signature}", f"{flight}/f2.tif?a"]
+    ).frames
+    assert [frame.name for frame in frames] == ["flight/f9.jpg", "other/f9.jpg", "f2.tif"]
+    assert read_metadata(frames[1].path).size == (60, 40)
+
+
 @pytest.mark.parametrize("name", ["f10.png", "f9.jpg", "f2.tif"])
 def test_the_same_image_as_from_disk(flight: str, tmp_path: Path, name: str) -> None:
     here, there = tmp_path / name, Path(f"{flight}/{name}")

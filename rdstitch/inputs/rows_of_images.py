@@ -1,0 +1,92 @@
+"""Which image each row of a table is about: the one whose path ends like the name in the row, in any case.
+
+Files in two folders may have one name, as of drones, whose numbers begin anew in each folder. A row is about the image
+that has most of its name in common, from the file's name towards the first folder. Of images of one name, which are
+called by their folders, the folders must agree too, as far as the row has any.
+"""
+
+from collections.abc import Iterable, Sequence
+from itertools import takewhile
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from rdstitch.errors import InputError
+from rdstitch.inputs.image_folders import place_of
+from rdstitch.inputs.tables import Row, name_parts
+from rdstitch.results.messages import shortened
+from rdstitch.system.file_access import canonical_name, without_query
+
+
+class NamedFile(Protocol):
+    """An image: what it is called, and its file."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def path(self) -> Path: ...
+
+
+class _Same(NamedTuple):
+    """How much two names have in common, in parts from the end; more is greater."""
+
+    folded: int  # in any case
+    exactly: int
+
+    @classmethod
+    def of(cls, place: Sequence[str], written: Sequence[str]) -> "_Same":
+        pairs = list(zip(reversed(place), reversed(written), strict=False))
+        alike = takewhile(lambda pair: pair[0].casefold() == pair[1].casefold(), pairs)
+        return cls(len(list(alike)), len(list(takewhile(lambda pair: pair[0] == pair[1], pairs))))
+
+
+class ImagesByName:
+    """Images, to be found by names in tables."""
+
+    def __init__(self, images: Sequence[NamedFile]) -> None:
+        self._images = images
+        # By the file's name in small letters, then by place, at which one file may be several times.
+        self._alike: dict[str, dict[tuple[str, ...], list[int]]] = {}
+        for index, image in enumerate(images):
+            *folders, _ = map(canonical_name, place_of(without_query(image.path)).parts)
+            place = (*folders, image.name.rpartition("/")[2])
+            self._alike.setdefault(place[-1].casefold(), {}).setdefault(place, []).append(index)
+
+    def file_names(self) -> Iterable[str]:
+        """The names of their files, each once, in small letters."""
+        return self._alike
+
+    def find(self, name: str, where: str) -> tuple[list[int], _Same]:
+        """Indices of the image of this name, none where there is none, and how much they have in common."""
+        written, best, found = name_parts(name), _Same(1, 0), list[list[int]]()
+        for place, indices in self._alike.get(written[-1].casefold(), {}).items() if written else ():
+            same, called = _Same.of(place, written), self._images[indices[0]].name.split("/")
+            if same >= best and same.folded >= min(len(called), len(written)):
+                found = [*found, indices] if same == best else [indices]
+                best = same
+        if len(found) > 1:
+            names = shortened([self._images[indices[0]].name for indices in found])
+            raise InputError(f"{where}: {written[-1]} could be any of {names}; write it with its folder")
+        return (found[0] if found else []), best
+
+
+class RowsByImage:
+    """Rows of which each is about one image."""
+
+    def __init__(self, rows: Iterable[Row]) -> None:
+        self._alike: dict[str, list[Row]] = {}
+        for row in rows:
+            self._alike.setdefault(row.image.casefold(), []).append(row)
+
+    def of(self, images: Sequence[NamedFile]) -> list[Row | None]:
+        """The row of each image, None where it has none."""
+        names, best = ImagesByName(images), dict[int, tuple[_Same, list[Row]]]()
+        for row in (row for name in names.file_names() for row in self._alike.get(name, ())):
+            indices, same = names.find(row.values["name"], row.where)
+            for index in indices:
+                before, rows = best.get(index, (same, []))
+                if same >= before:
+                    best[index] = same, [*rows, row] if same == before else [row]
+        for _, rows in best.values():
+            if len(rows) > 1:
+                raise InputError(f"{rows[1].where}: {rows[1].image} is here twice; remove one, or write their folders")
+        return [best[index][1][0] if index in best else None for index in range(len(images))]

@@ -1,0 +1,127 @@
+"""Maps, bags and poses for other programs: refused where they would be wrong or too large, and whole or not at all."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+
+from rdstitch.alignment.result import PlanarPoses
+from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.errors import ArgumentError, LimitError, OutputError
+from rdstitch.export import map_server
+from rdstitch.export.poses_of_result import poses_file
+from rdstitch.export.write_trajectory import write_trajectory
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.lens_model import LensModel
+from rdstitch.inputs.rosbag import opened_bag
+from rdstitch.results.pose import FollowedPoses, Pose
+from rdstitch.system.outputs import Outputs
+from rdstitch.tracking import TrackingResult
+from rdstitch.tracking.placement import CameraPose
+
+PATH = Trajectory(np.arange(2), np.zeros((2, 2)), np.zeros(2), np.ones(2))
+
+
+def test_the_memory_of_a_map_is_that_of_the_turned_strip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    metadata = SimpleNamespace(channels=1, bit_depth=8)
+    result: Any = SimpleNamespace(
+        output=tmp_path / "strip.png",
+        canvas=SimpleNamespace(size=(6000, 60)),
+        placed=SimpleNamespace(sources=[SimpleNamespace(metadata=metadata)]),
+        options=SimpleNamespace(composite=SimpleNamespace(max_memory=3 * 10**6)),
+    )
+    half = np.sqrt(0.5)
+    turn = np.array([[half, -half, 0.0], [half, half, 0.0]])
+    monkeypatch.setattr(map_server, "_pixel_to_metres", lambda *_: turn)
+    monkeypatch.setattr(map_server, "read_image", Mock(side_effect=AssertionError("decoded before it was refused")))
+    with pytest.raises(LimitError, match=r"map of 428\d x 428\d pixels"), Outputs(overwrite=False) as outputs:
+        map_server.write_map(result, tmp_path, 1.0, outputs)
+
+
+def _result(names: list[str], cameras: list[Camera]) -> Any:
+    poses = PlanarPoses(np.zeros(2), np.zeros((2, 2)), np.ones(2), np.zeros((2, 2)))
+    sources = [SimpleNamespace(name=name, metadata=SimpleNamespace(orientation=1, gps=None)) for name in names]
+    alignment = SimpleNamespace(cameras=tuple(cameras), poses=poses)
+    return SimpleNamespace(
+        registration=SimpleNamespace(sources=sources, alignment=alignment),
+        georeference=None,
+        not_georeferenced="",
+    )
+
+
+CAMERA = Camera((640, 480), -0.1, focal=500.0)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        Camera((480, 640), -0.1, focal=500.0),
+        replace(CAMERA, focal=800.0),
+        replace(CAMERA, distortion=0.0),
+        replace(CAMERA, lens_model=LensModel((500.0, 505.0), CAMERA.center, (0.1,) * 4)),
+    ],
+)
+def test_images_of_two_cameras_are_not_given_one(other: Camera) -> None:
+    with pytest.raises(ArgumentError, match=r"images\.txt: the images are of several cameras"):
+        poses_file(_result(["a.jpg", "b.jpg"], [CAMERA, other]), "images.txt")
+    same = poses_file(_result(["a.jpg", "b.jpg"], [CAMERA, replace(CAMERA, tilt=(0.1, 0.0))]), "images.txt")
+    assert [line.split()[-2:] for line in same.splitlines()[1::2]] == [["1", "a.jpg"], ["1", "b.jpg"]]
+
+
+@pytest.mark.parametrize("file", ["images.txt", "geo.txt"])
+def test_names_that_other_programs_would_cut_are_refused(file: str) -> None:
+    with pytest.raises(ArgumentError, match=rf"{file}: names end at blanks there; rename a b\.jpg"):
+        poses_file(_result(["a b.jpg", "b.jpg"], [CAMERA, CAMERA]), file)
+
+
+def test_a_bag_is_one_of_the_outputs(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    bag = tmp_path / "odom"
+
+    def write(*, overwrite: bool, meanwhile: Callable[[], object]) -> None:
+        with Outputs(overwrite) as outputs:
+            write_trajectory(PATH, bag, "bag", None, outputs)
+            meanwhile()
+
+    def appear() -> None:
+        bag.mkdir()
+        (bag / "metadata.yaml").write_text("mine")
+
+    with pytest.raises(OutputError, match="later"):
+        write(overwrite=True, meanwhile=Mock(side_effect=OutputError("later")))
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(OutputError, match="appeared during the run"):
+        write(overwrite=False, meanwhile=appear)
+    assert [file.read_text() for file in bag.iterdir()] == ["mine"]
+    (bag / "thesis.txt").write_text("mine")
+    with pytest.raises(OutputError, match="not a ROS bag"):
+        write(overwrite=True, meanwhile=list)
+    (bag / "thesis.txt").unlink()
+    write(overwrite=True, meanwhile=list)
+    with opened_bag(bag) as reader:
+        assert reader.message_count == len(PATH)
+    assert [item.name for item in tmp_path.iterdir()] == ["odom"]
+
+
+@pytest.mark.parametrize("error", [LimitError("large"), ArgumentError("wrong"), MemoryError()])
+def test_what_is_no_fault_of_the_bag_is_not_called_one(tmp_path: Path, error: Exception) -> None:
+    pytest.importorskip("rosbags")
+    with Outputs(overwrite=False) as outputs:
+        write_trajectory(PATH, tmp_path / "odom.bag", "bag", None, outputs)
+    with pytest.raises(type(error)), opened_bag(tmp_path / "odom.bag"):
+        raise error
+
+
+@pytest.mark.parametrize(("height", "unit"), [(None, 0.5), (2.0, 0.5), (2.0, np.nan)])
+def test_a_height_by_odometry_is_as_sure_as_all_its_lengths(height: float | None, unit: float) -> None:
+    placement: Any = SimpleNamespace(pose=CameraPose(3.0, 4.0, 0.0, 1.0))
+    tracked = TrackingResult(placement=placement, covariance=np.zeros((4, 4)), length_std=0.1, unit=unit, unit_std=0.1)
+    pose = Pose("a.jpg", 1, 0.0, tracked, poses=FollowedPoses(height))
+    std = np.sqrt(np.diag(pose.ros_covariance))[:3]
+    x, y, z = np.abs(pose.position)
+    np.testing.assert_allclose(std, 0.1 * np.array([x, y, 0.0 if height else z]))
