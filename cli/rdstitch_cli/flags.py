@@ -165,6 +165,8 @@ class FilePath(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Replace ``~``, also where no shell has; an address stays text: as a path it would lose one of its slashes."""
+        if value == "":  # as a path it would be the current folder
+            self.fail("a name is empty; was a variable of the shell not set?", param, ctx)
         if value in self.words or "://" in str(value):
             return value
         path = super().convert(value, param, ctx)

@@ -50,6 +50,7 @@ def _check(rdstitch: Run, folder: Path, arguments: list[str], status: int, *told
     ("command", "status", "told"),
     [
         # Mistyped.
+        ("mosaic  -o out.png", 2, "a name is empty"),
         ("panos a.png b.png -o out.png", 2, "No such command 'panos'"),
         ("pano a.png b.png", 2, "'-o'"),
         (PANO + "--colour", 2, "--colour"),
