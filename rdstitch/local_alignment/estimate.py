@@ -108,14 +108,13 @@ def align_locally(
     fitted, tested = placed.take(~held_out), placed.take(held_out)
     worthwhile = (1.0 - _WORTHWHILE) * _seam_residual(tested.residual)
     limit = worthwhile if choice == "auto" else math.inf
-
     straight = cache(lambda: _long_edges(edges, cameras))
     base = None
     if centers is not None:
         stiffness = Stiffness(cells, _SLOPE_OF_GROUND)
         ground = fit_ground(fitted, images, images.scale * centers, stiffness).fields(images, stiffness)
-        seams = _seam_residual(tested.residual_with(ground.delivered, images))
-        if seams <= worthwhile and seams + _bend(ground.delivered, straight()) <= worthwhile:
+        cost = _seam_residual(tested.residual_with(ground.delivered, images))
+        if cost <= worthwhile and cost + _bend(ground.delivered, straight()) <= worthwhile:
             base = ground
     candidates = list(_candidates(fitted, tested, images, min(coarse, cells), cells, base))
     costs = [_seam_residual(candidate.residual) for candidate in candidates]

@@ -17,8 +17,7 @@ from rdstitch.local_alignment.fit import PlacedFields, Reweighting, Stiffness, f
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches
 from rdstitch.system.late_imports import sparse
 
-# Ground is at most so high, as a share of the lowest camera's height.
-_HIGHEST = 0.5
+_HIGHEST = 0.5  # of the height of the lowest camera: what is higher comes near it, where parallax has no bound
 _MAX_NODES = 40_000  # of more, the grid is coarser
 
 
@@ -41,13 +40,13 @@ class Ground:
         return cls(origin, spacing, np.zeros((rows, columns)), centers)
 
     def nodes(self, places: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
-        """Nodes (M, 4) around places (M, 2) and their shares (M, 4)."""
+        """Nodes (M, 4) around places (M, 2) and their weights (M, 4)."""
         return nodes_around((places - self.origin) / self.spacing, self.heights.shape)
 
     def at(self, places: FloatArray) -> FloatArray:
         """Heights (M,) at places (M, 2)."""
-        nodes, shares = self.nodes(places)
-        return np.asarray((self.heights.ravel()[nodes] * shares).sum(axis=-1))
+        nodes, weights = self.nodes(places)
+        return np.asarray((self.heights.ravel()[nodes] * weights).sum(axis=-1))
 
     def fields(self, images: ImagesOnSurface, stiffness: Stiffness) -> PlacedFields:
         """How far it displaces what each image shows."""
@@ -70,13 +69,13 @@ def fit_ground(matches: PlacedMatches, images: ImagesOnSurface, centers: FloatAr
     prior = smoothness(ground.heights.shape, ground.spacing, stiffness.slope / lever, float(np.median(sides)))
     height, left, reweighting = np.zeros((len(matches), 1, 1)), matches.residual, Reweighting(matches)
     while (weight := reweighting.weights(left)) is not None:
-        share = height / (above - height)
-        places = ((matches.places + share * below) / (1.0 + share)).mean(axis=1)
-        lean = (places[:, None] - below) / (above - height)  # displacement by height
-        parallax = lean[:, 0] - lean[:, 1]
-        nodes, shares = ground.nodes(places)
+        ratio = height / (above - height)
+        places = ((matches.places + ratio * below) / (1.0 + ratio)).mean(axis=1)
+        by_height = (places[:, None] - below) / (above - height)  # displacement in either image of a unit of height
+        parallax = by_height[:, 0] - by_height[:, 1]
+        nodes, weights = ground.nodes(places)
         rows = np.arange(0, nodes.size + 1, 4)
-        design = sparse.csr_array((shares.ravel(), nodes.ravel(), rows), shape=(len(nodes), ground.heights.size))
+        design = sparse.csr_array((weights.ravel(), nodes.ravel(), rows), shape=(len(nodes), ground.heights.size))
         weighted = sparse.csr_array(design.T * (weight * (parallax**2).sum(axis=1)))
         right = design.T @ (weight * (parallax * matches.residual).sum(axis=1))
         solved = np.minimum(factorized(weighted @ design + prior).solve(right), highest)

@@ -13,8 +13,9 @@ from rdstitch.compositing import CompositeOptions, SeamBreak, SeamQuality
 from rdstitch.executors import open_executor
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
+from rdstitch.local_alignment import no_local_alignment
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.choose_layout import _error, choose_layout
+from rdstitch.pipeline.choose_layout import _alternatives, _error, _Trials, choose_layout
 from rdstitch.pipeline.compose import CanvasPlan
 from rdstitch.pipeline.lay_out import is_stretched
 from rdstitch.pipeline.realign import aligner_of, by_second_motions
@@ -72,6 +73,21 @@ def test_images_aligned_by_the_surface_whose_seams_break_are_aligned_by_the_othe
     for given in (far, near):
         chosen = choose_layout(given, options, aligner).registration.alignment
         np.testing.assert_allclose(chosen.transfer(0, 1, np.array([[380.0, 240.0]]))[0], offsets[0], atol=0.1)
+
+
+@pytest.mark.parametrize("by_heights", [False, True])
+def test_where_heights_of_the_ground_explain_parallax_no_other_model_is_tried(by_heights: bool, tmp_path: Path) -> None:
+    options = StitchOptions(workers=1, local_alignment="off", model="rigid", distortion=0.0)
+    sources = read_sources(_of_two_surfaces(tmp_path), camera=None, focal=None, distortion=0.0, skip_bad=False)[0]
+    with open_executor(1, len(sources)) as executor:
+        far = register(sources, Run(options), executor)
+    aligner = aligner_of(far, options, Purpose.MOSAIC)
+    near = by_second_motions(far, [(0, 1)], aligner)
+    assert near is not None
+    trials = _Trials(options, False, lambda image: np.empty((0, 2, 2)))
+    first = trials.lay_out(near, replace(no_local_alignment(""), by_heights=by_heights))
+    assert first.faults
+    assert bool(list(_alternatives(near, [first], trials, aligner))) is not by_heights
 
 
 def test_what_a_homography_stretches_is_laid_out_as_a_turn(shared_data: Callable[[str], Path]) -> None:
