@@ -12,5 +12,6 @@ def parabola_peak(before: Any, here: Any, after: Any) -> tuple[FloatArray, Float
 
     The place is given from the middle value on, in steps, at most half of one.
     """
-    rise, curvature = np.subtract(after, before, dtype=np.float64), np.minimum(before + after - 2.0 * here, -1e-9)
+    before, here, after = (np.asarray(values, dtype=np.float64) for values in (before, here, after))
+    rise, curvature = after - before, np.minimum(before + after - 2.0 * here, -np.finfo(np.float64).tiny)
     return np.clip(-rise / (2.0 * curvature), -0.5, 0.5), here - rise**2 / (8.0 * curvature)

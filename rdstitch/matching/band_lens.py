@@ -165,12 +165,12 @@ def _fit(camera: Camera, shifts: Sequence[_Shifts]) -> BandLens | None:
         return off
 
     result = optimize.least_squares(residuals, start, loss="cauchy", f_scale=near / 3.0, x_scale=0.01, max_nfev=50)
-    off = np.linalg.norm(residuals(result.x).reshape(-1, 2), axis=1)
-    if (off < near).mean() < _ENOUGH:
+    off = np.linalg.norm(result.fun.reshape(-1, 2), axis=1)
+    agreeing = off < near
+    if agreeing.mean() < _ENOUGH:
         return None
     moved = np.linalg.norm(seen(result.x) - points, axis=1)
     homography = np.eye(3) + np.append(result.x[:8], 0.0).reshape(3, 3)
-    agreeing = off < near
     return BandLens(homography, float(result.x[8]), float(np.median(moved)), float(np.median(off[agreeing])))
 
 

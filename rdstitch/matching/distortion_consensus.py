@@ -52,8 +52,6 @@ def vote(distortion: ArrayLike, std: ArrayLike) -> Consensus:
 
 def _scatter(residual: FloatArray, errors: FloatArray) -> float:
     """The additional standard deviation that makes the median of the normalized residuals what it should be."""
-    if len(residual) < 2:
-        return 0.0
     if len(residual) == 2:  # neither is nearer to the truth: by their difference alone
         return float(np.sqrt(max(np.diff(residual)[0] ** 2 - errors @ errors, 0.0) / 2.0))
     # Where the median of some ratios of squares is a number, that of the differences times it is zero.

@@ -97,9 +97,8 @@ def moving_features(features: FeatureStore, pairs: Sequence[PairRegistration], t
     The latter were matched otherwise at first; once the others are gone, they would find what is static, too.
     """
     moving = [np.ones(count, dtype=np.bool_) for count in features.counts]
-    places = defaultdict[Size | None, list[FloatArray]](
-        list
-    )  # by the size of the images: pixels of others are elsewhere
+    # By the size of the images: pixels of others are elsewhere.
+    places = defaultdict[Size | None, list[FloatArray]](list)
     for pair in pairs:
         motion = _Motion.of(pair, threshold)
         # Of a static pair all that move little, of others those of an overlay.

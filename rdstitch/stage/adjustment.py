@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 from rdstitch.stage.equations import LinkedPoints, StageEquations, StageState, Variances
 from rdstitch.stage.grid import TileGrid
 
 _ROUNDS = 12
 _GENEROUS = 20.0  # widths of the robust loss in the first round; it is halved until it is 1
 _WIDTH = 4.0  # standard deviations at which a link counts a quarter: Geman and McClure's loss
-_MEDIAN = 1.386  # median of the sum of two squared standard normal numbers
+_SQUARED_MEDIAN = RAYLEIGH_MEDIAN**2  # of the sum of two squared standard normal numbers
 _PAIR_STD = 0.03  # standard deviation of an error that all blocks of a pair share, pixels, before it is estimated
 _AGREEING_WEIGHT = 0.1  # of a block from which on the noise is also by it
 _MIN_NOISE = 0.1  # of the variances that blocks are said to have
@@ -110,7 +111,7 @@ def _reweighted(
     squared, of_blocks = equations.squared(state), equations.squared(state, of_blocks=True)
     agreeing = weights > _AGREEING_WEIGHT
     noise, excess = (
-        max(float(np.median(values[agreeing])) / _MEDIAN if agreeing.any() else 1.0, least)
+        max(float(np.median(values[agreeing])) / _SQUARED_MEDIAN if agreeing.any() else 1.0, least)
         for values, least in ((of_blocks, _MIN_NOISE), (squared, 1.0))
     )
     scale = excess * (width * _WIDTH) ** 2
@@ -140,7 +141,7 @@ def _variances(
 def _students_variance(squares: FloatArray, usual: float) -> float:
     """Variance of a coordinate by squared lengths of vectors, as of Student's distribution; as usual without any."""
     count = 1.0 / max(1, len(squares))
-    variance = float(np.median(squares)) / _MEDIAN if len(squares) else usual
+    variance = float(np.median(squares)) / _SQUARED_MEDIAN if len(squares) else usual
     for _ in range(5):
         tails = (_TAILS + 2.0) / (_TAILS + squares / max(variance, 1e-9))
         variance = (0.5 * float((tails * squares).sum()) + count * usual) / (len(squares) + count)

@@ -69,10 +69,8 @@ def with_measured_axes(
 
     nominal, *alternatives = product(*([axis.step, *axis.steps(search)] for axis in axes.values()))
     best = max([nominal, *(steps for steps in alternatives if len(steps) < 2 or _perpendicular(*steps))], key=evidence)
-    if (
-        evidence(best) < max(MIN_AXES_EVIDENCE, _MIN_RATIO * evidence(nominal))
-        or best is nominal
-        or all(np.abs(measured - step).max() <= search for measured, step in zip(best, nominal, strict=True))
+    if evidence(best) < max(MIN_AXES_EVIDENCE, _MIN_RATIO * evidence(nominal)) or all(
+        np.abs(measured - step).max() <= search for measured, step in zip(best, nominal, strict=True)
     ):
         return grid, ""
     steps = {k: _Step(axis.step, measured) for (k, axis), measured in zip(axes.items(), best, strict=True)}

@@ -179,7 +179,8 @@ class StageEquations:
     ) -> tuple["sparse.csr_matrix", FloatArray]:
         """Rows of the least-squares problem for the change of the state, and their right sides, of unit variance."""
         errors, by_lens = self.errors(state, of_blocks=True)
-        whiten = _block_diagonal(self.root * np.sqrt(weights / noise)[:, None, None])
+        roots = self.root * np.sqrt(weights / noise)[:, None, None]
+        whiten = sparse.bsr_matrix((roots, np.arange(len(roots)), np.arange(len(roots) + 1)), shape=(errors.size,) * 2)
         place = np.arange(errors.size), np.full(errors.size, self._entry.lens)
         blocks = self._by_blocks + sparse.csr_matrix((by_lens.ravel(), place), shape=self._by_blocks.shape)
         tile_std, row_std, column_std, pair_std = np.sqrt(variances)
@@ -192,10 +193,3 @@ class StageEquations:
         rows = sparse.vstack([whiten @ blocks, self._by_stage / tile_std, prior], format="csr")
         right = [-(whiten @ errors.ravel()), -self.off_stage(state).ravel() / tile_std, change / stds]
         return rows[:, : self._solved], np.concatenate(right)
-
-
-def _block_diagonal(blocks: FloatArray) -> "sparse.csr_matrix":
-    """The matrix with blocks (M, 2, 2) on its diagonal."""
-    side = 2 * len(blocks)
-    columns = np.repeat(np.arange(side).reshape(-1, 1, 2), 2, axis=1)
-    return sparse.csr_matrix((blocks.ravel(), columns.ravel(), 2 * np.arange(side + 1)), shape=(side, side))

@@ -91,7 +91,7 @@ def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
         masked = np.where(possible, values, 0.0).astype(np.float32)
         found |= dict.fromkeys((int(x[column]), int(y[row])) for column, row in peaks(masked, threshold, _WIDE_PEAKS))
     places = np.array(list(found), dtype=np.float64).reshape(-1, 2)
-    boxes = [Overlap.expected(0, 1, place, sizes[:, ::-1], 1) for place in places]
+    boxes = [Overlap.expected(place, sizes[:, ::-1], 1) for place in places]
     return places, np.array([log_evidence(tiles, box, at) for at, box in zip(places, boxes, strict=True)])
 
 

@@ -19,13 +19,11 @@ def _count(length: int, side: int) -> int:
 class Overlap:
     """Two tiles and what they should have in common."""
 
-    first: int
-    second: int
     offset: IntArray  # (2,), int: expected place of the second in the first, pixels
     blocks: IntArray  # (K, 4), int: boxes x0, y0, x1, y1 in the first tile, end exclusive
 
     @classmethod
-    def expected(cls, first: int, second: int, offset: FloatArray, sizes: IntArray, least: int) -> "Overlap":
+    def expected(cls, offset: FloatArray, sizes: IntArray, least: int) -> "Overlap":
         """Of tiles of sizes (2, 2), width and height, the second at an offset in the first; ``least`` pixels wide."""
         side = sizes[0]
         whole = np.rint(offset).astype(np.intp)
@@ -39,7 +37,7 @@ class Overlap:
         blocks = np.empty((count, 4), dtype=np.intp)
         blocks[:, :2], blocks[:, 2:] = low, high
         blocks[:, along], blocks[:, 2 + along] = edges[:-1], edges[1:]
-        return cls(first, second, whole, blocks)
+        return cls(whole, blocks)
 
     @property
     def whole(self) -> IntArray:

@@ -90,7 +90,7 @@ class PairFinder:
         if offset is None:
             offset = self.grid.places[second] - self.grid.places[first]
         sizes = -(-self.sizes[[first, second]] // scale)
-        return Overlap.expected(first, second, offset / scale, sizes, self.least // scale)
+        return Overlap.expected(offset / scale, sizes, self.least // scale)
 
     def candidates(self, read: Reader, known: float | None, progress: Progress) -> tuple[list[Candidates], float]:
         """Candidates of all pairs, and the λ by which they were found; where that is unknown, twice if need be."""

@@ -74,7 +74,7 @@ def correlate_frames(frames: Image, noise: FloatArray) -> tuple[Image, Image]:
     product = spectra[0] * np.conj(spectra[1])
     plain = fft.irfft2(product.sum(axis=0), s=shape)
     of_noise = (_NOISE_SHARE * np.sqrt(noise.prod(axis=0))).astype(np.float32)[:, None, None]
-    product /= np.abs(product) + of_noise + np.float32(1e-12)
+    product /= np.abs(product) + of_noise + np.finfo(np.float32).tiny
     power = float((np.abs(product) ** 2).sum()) * 2.0
     return fft.irfft2(product, s=shape) * (shape[0] * shape[1] / np.sqrt(power + 1e-12)), plain
 

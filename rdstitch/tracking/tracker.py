@@ -36,12 +36,10 @@ class TrackingOptions:
     """Choices and knowledge of a tracker."""
 
     pair: EstimationOptions = field(default_factory=EstimationOptions)  # with λ, where it is known
-    alignment: AlignmentOptions = field(
-        default_factory=AlignmentOptions
-    )  # with the λ of the cameras if ``pair`` has one
-    patient: bool = (
-        True  # whether alignments are waited for: the same frames give the same poses; else no frame waits long
-    )
+    # with the λ of the cameras if ``pair`` has one
+    alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
+    # whether alignments are waited for: the same frames give the same poses; else no frame waits long
+    patient: bool = True
 
 
 class FrameTracker:

@@ -32,7 +32,7 @@ _MAX_LINKS = 40  # up to which all are looked at; of more, so many of the least 
 # less than one in a hundred is, however many there are.
 _MOST_SAMPLED, _SAMPLED = 300, 0.05
 _CONFIDENCE = 1.645  # standard deviations that a normal variable exceeds with a probability of 5 %
-_IMAGES_AT_ONCE = 128  # that are kept while pairs are compared, 1 MB each
+_CACHED_IMAGES = 128  # that are kept while pairs are compared, 1 MB each
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class ComparedImages:
         self.threads = threads
         self._locks = [Lock() for _ in sources]  # links of one image are compared at the same time
 
-        @lru_cache(_IMAGES_AT_ONCE)
+        @lru_cache(_CACHED_IMAGES)
         def read(k: int) -> ComparedImage:
             reduction = fitting_reduction(max(sources[k].camera.image_size) / COMPARED_SIDE)
             return ComparedImage.of(sources[k].read(reduction, keep=True), sources[k].camera, np.eye(3), stretch)
@@ -88,8 +88,8 @@ def check_overlaps(registration: Registration, images: ComparedImages, cache: Ca
     alignment = registration.alignment
     used = [fit for fit in alignment.links if fit.used]
     sampled = _at_random(used)
-    least = {fit.images for fit in _least_confirmed(used)}
-    chosen = [fit for fit in used if fit.images in least or fit.images in sampled]
+    looked_at = _least_confirmed(used) | sampled
+    chosen = [fit for fit in used if fit.images in looked_at]
     every = sorted(set(chain.from_iterable(fit.images for fit in chosen)))
     described = [
         (k, source.content(cache), source.mask_content(cache), alignment.cameras[k], alignment.homographies[k])
@@ -170,12 +170,11 @@ def _at_random(links: Sequence[LinkFit]) -> set[tuple[int, int]]:
     return {links[k].images for k in np.random.default_rng(0).choice(len(links), count, replace=False)}
 
 
-def _least_confirmed(links: Sequence[LinkFit]) -> list[LinkFit]:
-    """The links in the fewest triangles, then those with the fewest inliers; in their own order."""
+def _least_confirmed(links: Sequence[LinkFit]) -> set[tuple[int, int]]:
+    """Images of the links in the fewest triangles, then of those with the fewest inliers."""
     beside: dict[int, set[int]] = {}
     for fit in links:
         beside.setdefault(fit.image1, set()).add(fit.image2)
         beside.setdefault(fit.image2, set()).add(fit.image1)
     doubtful = sorted(links, key=lambda fit: (len(beside[fit.image1] & beside[fit.image2]), fit.inliers))
-    chosen = {fit.images for fit in doubtful[:_MAX_LINKS]}
-    return [fit for fit in links if fit.images in chosen]
+    return {fit.images for fit in doubtful[:_MAX_LINKS]}

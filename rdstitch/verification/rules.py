@@ -23,9 +23,8 @@ from rdstitch.verification.second_motions import fills_at_most
 def _disagreeing_pairs(evidence: ResultEvidence) -> Iterator[Finding]:
     """Pairs of whose matches most do not fit into the whole."""
     for fit in evidence.used:
-        if fit.inliers < Limits.min_pair_inlier_fraction.value * fit.count and not evidence.explained_by_depth(
-            fit.images
-        ):
+        few = fit.inliers < Limits.min_pair_inlier_fraction.value * fit.count
+        if few and not evidence.explained_by_depth(fit.images):
             reason = _reason(evidence, fit.images, [fit], "stitch them on their own")
             yield Finding(Kind.PAIR_MISFITS, fit.images, values={**_counts([fit]), "reason": reason})
 
@@ -42,9 +41,8 @@ def _misfitting_images(evidence: ResultEvidence) -> Iterator[Finding]:
 
 def _matches_disagree(evidence: ResultEvidence) -> Iterator[Finding]:
     counts = _counts(evidence.used)
-    if counts["inliers"] < Limits.min_pair_inlier_fraction.value * counts["count"] and not evidence.explained_by_depth(
-        ()
-    ):
+    few = counts["inliers"] < Limits.min_pair_inlier_fraction.value * counts["count"]
+    if few and not evidence.explained_by_depth(()):
         yield Finding(Kind.MATCHES_DISAGREE, values=counts)
 
 

@@ -62,13 +62,12 @@ def planes_of_pairs(registration: Registration, threshold: float, threads: int =
 def _least_needed(fills: Mapping[Pair, float]) -> float:
     """The share from which on pairs join all images that all of them join: those of less may show anything."""
     surest = sorted(fills, key=lambda pair: -fills[pair])
-    images = sorted({k for pair in surest for k in pair})
-    if not images:
+    if not surest:
         return math.inf
+    images = 1 + max(map(max, surest))
 
     def parts(count: int) -> int:
-        firsts, seconds = zip(*surest[:count], strict=True)
-        return len([part for part in connected_components(images[-1] + 1, firsts, seconds) if part[0] in images])
+        return len(connected_components(images, *zip(*surest[:count], strict=True)))
 
     return fills[surest[bisect_left(range(1, len(surest)), -parts(len(surest)), key=lambda count: -parts(count))]]
 

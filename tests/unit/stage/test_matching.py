@@ -34,7 +34,7 @@ def _tiles(seed: int, shift: FloatArray = SHIFT, noise: float = 0.02) -> tuple[I
 
 
 def _overlap(shift: FloatArray = SHIFT) -> Overlap:
-    return Overlap.expected(0, 1, shift, np.array([[160, 120]] * 2), 5)
+    return Overlap.expected(shift, np.array([[160, 120]] * 2), 5)
 
 
 def test_the_correlation_is_highest_at_the_displacement_and_evidence_is_for_it_alone() -> None:

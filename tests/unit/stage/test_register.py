@@ -275,7 +275,7 @@ def test_a_wrong_period_of_a_pattern_does_not_win_by_the_height_of_its_peak(seed
     ground = dots + 30.0 * clouds / clouds.std()
     tiles = [ground[20:276, 10:266], ground[23:279, 225:481]]
     tiles = [(tile + rng.normal(0.0, 12.0, size=tile.shape)).astype(np.float32) for tile in tiles]
-    overlap = Overlap.expected(0, 1, np.array([212.0, 0.0]), np.full((2, 2), 256), 5)
+    overlap = Overlap.expected(np.array([212.0, 0.0]), np.full((2, 2), 256), 5)
     surface = correlate(tiles[0], tiles[1], overlap, 30).total(np.zeros((len(overlap.blocks), 2)), 30)
     highest = np.unravel_index(int(surface.argmax()), surface.shape)
     assert np.abs(np.array(highest) - (33, 33)).max() > 5
