@@ -21,9 +21,7 @@ from rdstitch_cli.terminal import Reporter
 Inputs = Annotated[tuple[Path, ...], "INPUT..."]  # an argument rather than an option
 ImageFile = Annotated[Path, Option("Image to write: .jpg, .png, .tif, .webp or .dzi.", flag="-o --output", writes=True)]
 PrintSidecar = Annotated[bool, Option("Print the sidecar as JSON.", flag="--json")]
-
-
-GOES_ON = "the same command goes on from the cache"  # note at an interrupt
+_GOES_ON = "the same command goes on from the cache"  # note at an interrupt
 
 
 def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callable[..., Any]], click.Command]:
@@ -41,7 +39,7 @@ def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callab
                     return function(reporter=reporter, **given)
             except BaseException as error:
                 if given.get("cache") is not None:
-                    error.add_note(GOES_ON)
+                    error.add_note(_GOES_ON)
                 raise
 
         parameters: list[click.Parameter] = []

@@ -74,7 +74,6 @@ def followed(
 
     if len(inputs) != 1:
         raise click.UsageError("--follow takes one input: a folder, a video, the index of a camera, a stream or -")
-    # An address is text: as a path it would lose one of its slashes.
     source, output = Path(inputs[0]), files.bag or files.written[0]
     if source.is_dir() and output.resolve().parent == source.resolve():
         raise click.UsageError(f"{output}: lies in the folder that is followed; choose a name in another folder")
@@ -85,7 +84,7 @@ def followed(
     before = None if preview is None else file_state(preview)
     with TemporaryFolder() as folder:
         arrivals = open_frame_stream(
-            str(inputs[0]),
+            str(inputs[0]),  # as a path an address would lose one of its slashes
             frames_folder=lambda: folder,
             names=sys.stdin,
             every=every or 1,

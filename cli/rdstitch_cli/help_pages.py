@@ -37,7 +37,7 @@ Exit status:
   2    wrong usage
   3    a file cannot be read
   4    no overlap, or no reliable result
-  5    partial result under --strict, or most tiles lie where the stage says
+  5    partial result under --strict, or most tiles keep the stage's own places
   6    output cannot be written, or exists (see --overwrite)
   7    refused: too large for memory, format or common sense
   130  interrupted; 143 when asked to end by SIGTERM, 129 by SIGHUP

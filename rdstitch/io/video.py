@@ -43,18 +43,21 @@ def extract_frames(path: Path, folder: Path, wanted: Callable[[int], bool]) -> t
     And why frames may be missing; empty where the video goes on as long as its header says.
     """
     written: list[VideoFrame] = []
-    damage = ""
+    damage, lost = "", 0
     for number, timestamp, capture in _grabbed(path):
         count, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
         cut_off = number + 1 < _CUT_OFF * count and timestamp * rate < _CUT_OFF * count
         damage = f"ends after {number + 1} of {count:.0f} frames; copy it again from its source" if cut_off else ""
-        decoded, frame = capture.retrieve() if wanted(number) else (False, None)
+        is_wanted = wanted(number)
+        decoded, frame = capture.retrieve() if is_wanted else (False, None)
+        lost += is_wanted and not decoded
         if decoded and frame is not None:
             file = write_frame(folder / f"{path.stem}_{number:06d}.png", frame)
             written.append(VideoFrame(file, number, timestamp))
     if not written:
         raise InputError(f"{path}: the video has no frame that can be read")
-    return written, damage
+    undecoded = f"{lost} frame{'s' * (lost != 1)} cannot be decoded and {'is' if lost == 1 else 'are'} left out"
+    return written, "; ".join([damage] * bool(damage) + [undecoded] * bool(lost))
 
 
 def _grabbed(path: Path) -> Iterator[tuple[int, float, cv2.VideoCapture]]:

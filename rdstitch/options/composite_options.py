@@ -27,6 +27,10 @@ _CONTRADICTIONS = (
 )
 
 
+def _is_scalar(value: Any) -> bool:
+    return value is None or isinstance(value, str | int | float)
+
+
 @documented
 @dataclass(frozen=True)
 class CompositeOptions(UprightOptions):
@@ -131,15 +135,15 @@ class CompositeOptions(UprightOptions):
         """The same with other options; what is given takes the place of all that says the same in another way."""
         defaults = {each.name: each.default for each in fields(self)}
         # What turns nothing, crops nothing, or is left open contradicts nothing; scale=1 and straighten="off" do.
-        stated = [name for name, value in given.items() if value not in (None, "none", 0.0)]
+        stated = [name for name, value in given.items() if not (_is_scalar(value) and value in (None, "none", 0.0))]
         contradictions = (*_CONTRADICTIONS, *TURN_CONTRADICTIONS)
         replaced = {other for name in stated for each in contradictions for other in each.against(name)}
         if {"scale", "gsd"} & given.keys():
             replaced.add("max_size")  # it would reduce them
-        new: dict[str, Any] = {name: defaults[name] for name in replaced} | given
-        if any(new.get(name, now) != now for name, now in (("like", self.like), ("epsg", self.epsg))):
-            new = {"extent": None} | new  # it is in metres of that map
-        return replace(self, **new)
+        changed: dict[str, Any] = {name: defaults[name] for name in replaced} | given
+        new = replace(self, **changed)
+        is_of_other_map = (new.like, new.epsg) != (self.like, self.epsg)
+        return replace(new, extent=None) if is_of_other_map and "extent" not in given else new
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -51,9 +51,14 @@ class Option:
     def limits(self) -> str:
         """The limits, in words."""
         if math.isfinite(self.least) and math.isfinite(self.most):
-            return f" from {self.least:g} to {self.most:g}"
+            return f" from {_number(self.least)} to {_number(self.most)}"
         limits = {"of at least": self.least, "above": self.above, "of at most": self.most, "below": self.below}
-        return " and".join(f" {words} {value:g}" for words, value in limits.items() if math.isfinite(value))
+        return " and".join(f" {words} {_number(value)}" for words, value in limits.items() if math.isfinite(value))
+
+
+def _number(value: float) -> str:
+    """All digits of a whole number."""
+    return f"{value:.0f}" if float(value).is_integer() else f"{value:g}"
 
 
 def option(value: Any, text: str, metavar: str = "", flag: str = "", **more: Any) -> Any:

@@ -212,7 +212,7 @@ class Tracker:
         body: BodyPose | None = None,
     ) -> list[Pose]:
         """Register a frame that was read; it comes last, after those before it whose place is new."""
-        label = Pose(frame.path.name, frame.number or 0, math.nan, TrackingResult(), reason, self._poses)
+        label = Pose(frame.name, frame.number or 0, math.nan, TrackingResult(), reason, self._poses)
         if source is None or image is None:
             return [label]
         label = replace(label, name=source.name, timestamp=float(timestamps_of([source])[0]))

@@ -20,7 +20,7 @@ from rdstitch.io.opening import check_readable
 from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.records import ImageRecord, MatchedBy
-from rdstitch.system.file_access import canonical_name, canonical_text
+from rdstitch.system.file_access import canonical_name, canonical_text, without_query
 
 _TOKEN = re.compile(r"\d+|[^\W\d_]+|[\W_]+")
 
@@ -69,7 +69,7 @@ def _without_counterpart(chosen: Chosen, frames: Sequence[Frame]) -> list[Messag
 def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[Path], str]) -> Chosen:
     given: dict[str, list[Frame]] = {}
     for frame in frames:
-        given.setdefault(canonical_name(key(frame.path)), []).append(frame)
+        given.setdefault(canonical_name(key(without_query(frame.path))), []).append(frame)
     chosen, taken = list[Frame | None](), set[int]()
     for image in saved.images:
         *folders, name = Path(canonical_text(image.name)).parts or ("",)
@@ -106,7 +106,7 @@ def _folders(frame: Frame) -> list[str]:
 def _by_varying_part(saved: SavedRegistration, frames: Sequence[Frame]) -> Chosen | None:
     """By what differs between names of one side, as of V07_RED.jpg and V07_NIR.jpg."""
     ours = _varying_parts([image.name for image in saved.images])
-    theirs = _varying_parts([frame.path.name for frame in frames])
+    theirs = _varying_parts([without_query(frame.path).name for frame in frames])
     if ours is None or theirs is None or not set(ours) & set(theirs):
         return None
     files = dict(zip(theirs, frames, strict=True))

@@ -27,9 +27,9 @@ from rdstitch.sidecar.records import (
 )
 
 
-def recorded_path(path: Path, output: Path | None) -> str:
+def recorded_path(path: Path, output: Path | None, *, was_file: bool = False) -> str:
     """A file as the sidecar of an output has it, from its folder on; an absolute name, or what is no file, as it is."""
-    if output is None or path.is_absolute() or not path.exists():
+    if output is None or path.is_absolute() or not (was_file or path.exists()):
         return str(path)
     named, folder = path.parent.resolve() / path.name, output.parent.resolve()
     return str(named) if named.drive != folder.drive else Path(os.path.relpath(named, folder)).as_posix()

@@ -43,9 +43,9 @@ class SavedRegistration:
         return self.record.images
 
     def original(self, image: ImageRecord) -> Path | None:
-        """Its file, if it is still there: from the sidecar's folder on or, as earlier ones had it, the current one."""
-        path = Path(image.path)
-        return next((file for file in (self.path.parent / path, path) if file.is_file()), None)
+        """Its file, if it is still where the sidecar has it."""
+        file = self.path.parent / image.path
+        return file if file.is_file() else None
 
     @cached_property
     def reference(self) -> int:

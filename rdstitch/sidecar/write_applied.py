@@ -1,7 +1,6 @@
 """The sidecar of an image that was composed again: what was estimated then, of the images that are in it now."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from msgspec import UNSET
@@ -24,6 +23,7 @@ from rdstitch.sidecar.parts import (
 )
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.records import VERSION, Applied, ImageRecord, MatchedBy
+from rdstitch.system.file_access import is_url
 from rdstitch.system.records import to_jsonable
 
 
@@ -116,7 +116,8 @@ def _unused_image(
     lens = {} if image.camera is None else lens_fields(image.camera)
     reason = image.reason if left_out is None else left_out.text
     gone = {"used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
-    gone["path"] = recorded_path(saved.original(image) or Path(image.path), output.output)
+    if not is_url(image.path):
+        gone["path"] = recorded_path(saved.path.parent / image.path, output.output, was_file=True)
     return replace_fields(image, **lens, **gone, lambda2=UNSET)
 
 

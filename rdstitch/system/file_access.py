@@ -136,10 +136,9 @@ def remote_names(url: str) -> list[str]:
 def _filesystem(path: str | Path) -> tuple[Any, str]:
     """The file system of a URL, and the name in it."""
     try:
-        core = import_module("fsspec.core")
-    except ImportError:
-        raise OSError("URLs need fsspec: pip install 'fsspec[http]'") from None
-    system, name = core.url_to_fs(url_of(path))
+        system, name = import_module("fsspec.core").url_to_fs(url_of(path))
+    except ImportError as error:  # of fsspec, or of what it needs for this kind of URL
+        raise OSError(f"URLs need fsspec: pip install 'fsspec[http]' ({error})") from None
     return system, name
 
 

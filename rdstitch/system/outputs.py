@@ -247,12 +247,11 @@ class Outputs:
 
     def make_folder(self, folder: Path) -> None:
         """Make a folder for outputs, which goes again at the end if nothing is in it."""
-        missing = [place for place in (folder, *folder.parents) if not place.exists()]
+        self._made[:0] = [place for place in (folder, *folder.parents) if not place.exists()]
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"{folder}: cannot make the folder: {error.strerror}") from error
-        self._made[:0] = missing
 
     @contextmanager
     def writing(

@@ -140,7 +140,7 @@ def test_another_band_in_order(rdstitch: Run, frames: list[Path], stitched: Path
 def test_originals_are_found_from_the_folder_of_the_sidecar(
     frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """So that another band's lens is compared wherever one stands; sidecars from before have the current folder's."""
+    """So that another band's lens is compared wherever one stands, and no image of the current one is an original."""
     flight, elsewhere = tmp_path / "flight", tmp_path / "elsewhere"
     elsewhere.mkdir()
     _written(frames, flight, [frame.name for frame in frames])
@@ -159,8 +159,7 @@ def test_originals_are_found_from_the_folder_of_the_sidecar(
     sidecar.write_text(sidecar.read_text("utf-8").replace("../flight/", ""), "utf-8")
     assert any("was not compared" in message.text for message in apply(sidecar, [shifted]).messages)
     monkeypatch.chdir(flight)
-    with pytest.raises(InputError, match="was not taken from the same place"):
-        apply(sidecar, [shifted])
+    assert any("was not compared" in message.text for message in apply(sidecar, [shifted]).messages)
 
 
 def test_equal_names_of_another_flight_are_refused_and_other_images_named(

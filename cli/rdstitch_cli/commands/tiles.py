@@ -85,7 +85,7 @@ def tiles(
 
 
 def _check_placed(tiled: "TileRegistration | None") -> None:
-    """End with the status of a partial result where most tiles lie where the stage was told to go, right or wrong."""
+    """End with the status of a partial result where most tiles keep the stage's own places, right or wrong."""
     if tiled is not None and tiled.mostly_nominal:
         alone = len(tiled.grid) - int(tiled.linked.sum())
         raise PartialResultError(

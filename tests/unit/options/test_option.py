@@ -115,6 +115,8 @@ def test_arrays_become_tuples_of_numbers() -> None:
         ({"scale": 0.5, "rotate": 9.0}, {"like": "a.tif"}, {"scale": 1.0, "rotate": 0.0}),
         ({"like": "a.tif", "extent": (0, 0, 1, 1)}, {"gsd": 0.1}, {"like": None, "extent": None}),
         ({"like": "a.tif"}, {"rotate": 0.0, "crop": "none"}, {}),
+        ({"like": "a.tif", "extent": (0, 0, 1, 1)}, {"like": Path("a.tif")}, {}),
+        ({"max_size": 1200}, {"extent": np.array([0, 0, 1, 1])}, {"max_size": None}),
         ({"gsd": 0.1}, {"scale": 1.0}, {"gsd": None}),
         ({"rectangle": (0, 0, 9, 0, 9, 9, 0, 9)}, {"straighten": "off"}, {"rectangle": None}),
         ({"level": True}, {"straighten": "auto"}, {"level": False}),
