@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.errors import ArgumentError, InputError
@@ -14,6 +15,7 @@ from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.rosbag import _eight_bits, _grey_of_compressed
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import read_sources
+from rdstitch.io import video as video_reader
 from tests.videos import write_video
 
 
@@ -177,3 +179,24 @@ def test_damaged_images_are_none_or_what_is_left_without_a_word(capfd: pytest.Ca
         _grey_of_compressed(data)
     assert _grey_of_compressed(np.frombuffer(b"no image", np.uint8)) is None
     assert capfd.readouterr().err == ""
+
+
+def test_frames_that_cannot_be_decoded_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clip = video(tmp_path / "clip.avi")
+
+    class Faulty:
+        """A capture that does not decode the second frame."""
+
+        def get(self, what: int) -> float:
+            return {cv2.CAP_PROP_FRAME_COUNT: 3.0, cv2.CAP_PROP_FPS: 25.0}[what]
+
+        def __init__(self, number: int) -> None:
+            self.number = number
+
+        def retrieve(self) -> tuple[bool, NDArray[np.uint8] | None]:
+            return (True, np.zeros((48, 64, 3), np.uint8)) if self.number != 1 else (False, None)
+
+    monkeypatch.setattr(video_reader, "_grabbed", lambda path: ((k, k / 25.0, Faulty(k)) for k in range(3)))
+    found = find_images([clip], frames_folder=lambda: tmp_path, every=1)
+    assert len(found.frames) == 2
+    assert [message.text for message in found.messages] == ["1 frame cannot be decoded and is left out"]
