@@ -10,7 +10,7 @@ from rdstitch.alignment.frames.reference_frame import frontal_reference, in_fram
 from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.choices import Purpose
 from rdstitch.features import LightGlue, match
-from rdstitch.inputs.measurements import positions_of
+from rdstitch.inputs.positions import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import first_pairs
 from rdstitch.matching.mixed_lenses import separate_lenses
