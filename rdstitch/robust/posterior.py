@@ -174,7 +174,7 @@ def overlap_cells(link: IntArray, points: FloatArray, count: int, side: int) -> 
 class ErrorCost:
     """What the errors of G problems say of a hypothesis, each array (G,)."""
 
-    cost: FloatArray  # -2 log of their likelihood, up to a constant of the problem
+    cost: FloatArray  # -2 log of their likelihood, up to a constant of the problem, with what parameters cost
     field: FloatArray  # size of what neighbours share, pixels of a coordinate
     # independent coordinates: all where there is noise only, a pair of them a cell or block where the field is large
     count: FloatArray
@@ -232,8 +232,7 @@ class Evidence:
         squared = np.einsum("ck,ck->c", mean, mean)
         sizes = np.geomspace(MODEL_ERROR, np.maximum(self.farthest, 2.0 * MODEL_ERROR), _SIZES)
         coarse = np.concatenate([np.zeros((1, groups)), sizes])
-        best = ErrorCost(np.full(groups, np.inf), np.zeros(groups), np.full(groups, 2.0))
-        every = np.arange(groups)
+        tried = list[tuple[FloatArray, FloatArray, FloatArray]]()
         for fine in sizes:
             # A cell's mean error has the variance of its noise and of its own field; blocks of cells share another one.
             variance = (fine**2)[group] + (self.noise**2)[group] / self.counts
@@ -251,14 +250,10 @@ class Evidence:
             counts = np.maximum(2.0 * self.weight * (fields**2 + self.noise**2) * left, 2.0)
             costs = np.stack([np.bincount(self.group, each, groups) for each in of_blocks])
             costs = self.weight * (of_cells + costs) + parameters * np.log(counts)
-            least = np.argmin(costs, axis=0), every
-            better = costs[least] < best.cost
-            best = ErrorCost(
-                np.where(better, costs[least], best.cost),
-                np.where(better, fields[least], best.field),
-                np.where(better, counts[least], best.count),
-            )
-        return best
+            tried.append((costs, fields, counts))
+        costs, fields, counts = map(np.concatenate, zip(*tried, strict=True))
+        least = np.argmin(costs, axis=0), np.arange(groups)
+        return ErrorCost(costs[least], fields[least], counts[least])
 
 
 def farthest_error(scale: FloatArray) -> FloatArray:
