@@ -232,7 +232,7 @@ def trajectory(
         File to write.
     layout : str
         "csv", "tum" or "kitti", see :mod:`rdstitch.export.trajectory_files`; "bag": ``nav_msgs/Odometry``, see
-        :mod:`rdstitch.export.odometry_bag`.
+        :mod:`rdstitch.export.write_trajectory`.
     plot : path, optional
         SVG file to draw the path to.
     height : float, optional
