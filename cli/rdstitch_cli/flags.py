@@ -71,12 +71,6 @@ def flags_of(options: Any, *, only: str = "", without: str = "") -> list[click.O
     return [_flag(o, getattr(options, o.name)) for o in chosen if o.name not in without.split()]
 
 
-def flags(**options: tuple[Any, Any]) -> list[click.Option]:
-    """Flags by the names of parameters: their annotations and defaults."""
-    found = ((declaration(name, annotation), default) for name, (annotation, default) in options.items())
-    return [_flag(option, default) for option, default in found if option is not None]
-
-
 def values_of(kind: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     """The options of a class among those that a command was given."""
     options = ((name, option.option) for name, option in declared(kind).items())

@@ -137,11 +137,7 @@ def apply_found(
         return result
     page = partial(plainly_viewed, result.canvas, [source.name for source in sources.values()])
     result = replace(result, messages=(*result.messages, *write_page(result, outputs, page)))
-    homographies = list(plan.placed.homographies)
-    record = applied_sidecar(
-        saved, result, sources, homographies, given.left_out, given.matched, same_lens=lens is None
-    )
-    outputs.write(f"{output}.json", json_bytes(record))
+    outputs.write(f"{output}.json", json_bytes(applied_sidecar(result, same_lens=lens is None)))
     return result
 
 
