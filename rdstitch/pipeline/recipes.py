@@ -26,14 +26,20 @@ from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.camera_path import camera_path
 from rdstitch.pipeline.choose_layout import choose_layout
 from rdstitch.pipeline.compose import compose_images
-from rdstitch.pipeline.deep_zoom_page import viewed_images, write_page
 from rdstitch.pipeline.lay_out import CandidateLayout
 from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.read_inputs import in_order, read_inputs
 from rdstitch.pipeline.realign import aligner_of, with_reference_of
 from rdstitch.pipeline.register import register
 from rdstitch.pipeline.run import Run, started
-from rdstitch.pipeline.run_files import RunFiles, check_world_files, report_refused, stage_beside
+from rdstitch.pipeline.run_files import (
+    RunFiles,
+    check_world_files,
+    report_refused,
+    stage_beside,
+    viewed_images,
+    write_page,
+)
 from rdstitch.pipeline.run_on_sources import blocks_on
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason

@@ -21,9 +21,8 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, draft_with_loops, impossible_estimates_fail
 from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.image_circle import with_image_circle
-from rdstitch.pipeline.match_crossings import match_crossings
+from rdstitch.pipeline.repeated_patterns import match_crossings, settle_repeated_pattern
 from rdstitch.pipeline.run import Run
-from rdstitch.pipeline.settle_repeated_pattern import settle_repeated_pattern
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.results.registration import Registration
