@@ -25,10 +25,7 @@ _GOES_ON = "the same command goes on from the cache"  # note at an interrupt
 
 
 def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callable[..., Any]], click.Command]:
-    """A command of a function: its parameters with options become flags, and so do the options given.
-
-    Values of those arrive as ``**given``; -q and -v as ``reporter``.
-    """
+    """A command of a function: flags of its parameters and of the options given, whose values arrive as ``**given``."""
 
     def make(function: Callable[..., Any]) -> click.Command:
         @wraps(function)
@@ -146,10 +143,7 @@ def _check_not_read(written: Iterable[Path], camera: Path | None) -> None:
 
 
 class FilePath(click.Path):
-    """A file or folder, or a word that stands for something else; a file of that name is written ``./word``.
-
-    Whether a file can be read is for the library to find out: it knows more, and has an exit status for it.
-    """
+    """A file or folder, which the library checks, or a word that stands for something else; ``./word`` is a file."""
 
     def __init__(self, words: Sequence[str] = (), *, allow_dash: bool = False) -> None:
         super().__init__(path_type=Path, readable=False, allow_dash=allow_dash)

@@ -54,10 +54,7 @@ def followed(
     refresh: float = 0.0,
     poses: "FollowedPoses | None" = None,
 ) -> Iterator[list["Named"]]:
-    """Print a line for each frame as it arrives; then, inside the block, what all of them are as inputs of a recipe.
-
-    ``files`` are those of the recipe, and ``poses`` says how poses are printed: as the recipe writes them.
-    """
+    """Print a line for each frame as it arrives; then, inside the block, what all of them are as inputs of a recipe."""
     from rdstitch.inputs.frame_stream import open_frame_stream
     from rdstitch.system.file_access import file_state
     from rdstitch.system.outputs import Outputs

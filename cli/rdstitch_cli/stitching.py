@@ -71,9 +71,7 @@ def files_beside(given: Mapping[str, Any]) -> FilesBeside:
 
 
 def report_result(result: "StitchResult", reporter: Reporter, *, as_json: bool, more: str = "") -> None:
-    """λ and the plan of a dry run, or the sidecar, to standard output; what the user must know, and what was made, to
-    standard error.
-    """
+    """λ and the plan of a dry run, or the sidecar, to standard output; all else to standard error."""
     from rdstitch.sidecar.write import sidecar
 
     report_registration(result.registration, reporter, partial(sidecar, result) if as_json else None)

@@ -286,9 +286,7 @@ def _registered(listed: FoundImages, run: Run) -> Registration:
 
 @contextmanager
 def _failures_explained(run: Run, known: Sequence[Message]) -> Iterator[None]:
-    """A registration that fails in the block names what could not be read well; of one that is refused the report is
-    written.
-    """
+    """Failures of the block name what could not be read well; of a result that is refused the report is written."""
     try:
         yield
     except RegistrationError as error:
@@ -303,10 +301,9 @@ def _failures_explained(run: Run, known: Sequence[Message]) -> Iterator[None]:
 def _accepted(
     sources: Sequence[Source], known: Sequence[Message], run: Run, executor: Executor
 ) -> tuple[Registration, Run]:
-    """Register and check, with what is known of the inputs already.
+    """Register and check, in pixels of the working size.
 
-    In pixels of the working size. Where the first image shall be the reference, but was left out, the first that is
-    used becomes it: the run says so then.
+    Where the first image shall be the reference, but was left out, the first that is used is, and the run says so.
     """
     registration = register(sources, run, executor).with_messages(known)
     run.progress("checking", 0, 1)

@@ -139,10 +139,7 @@ def match_crossings(
 def _matched(
     pair: PairRegistration, alignment: Alignment, crossings: Mapping[int, FloatArray], threshold: float
 ) -> PairRegistration:
-    """A pair by the crossings that lie where the alignment expects them, and no others near; as it was if they are few.
-
-    Crossings are (N, 2) in pixels, as the threshold.
-    """
+    """A pair by the crossings (N, 2), pixels, where the alignment expects them and no others near; as it was if few."""
     first, second = crossings[pair.image1], crossings[pair.image2]
     expected = alignment.transfer(pair.image1, pair.image2, first)
     seen = np.flatnonzero(np.isfinite(expected).all(axis=1))

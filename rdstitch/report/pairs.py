@@ -210,10 +210,8 @@ def pairs_of(registration: Registration) -> dict[tuple[int, int], PairRegistrati
 def residuals(
     registration: Registration, pairs: Mapping[tuple[int, int], PairRegistration], fit: LinkFit
 ) -> tuple[FloatArray, FloatArray]:
-    """Give where the matches of a link are in the second image, and how far from there the alignment puts them, pixels.
-
-    Matches that the pair itself takes for wrong are left out, and those that miss by more than four times the link's
-    error.
+    """Where the inliers of a link are in the second image, and how far from there the alignment puts them, pixels;
+    without those that miss by more than four times the link's error.
     """
     pair = pairs[fit.image1, fit.image2]
     inliers = pair.relation.inliers

@@ -24,11 +24,7 @@ from rdstitch.system.records import to_jsonable
 
 
 def applied_sidecar(result: Recomposition, *, same_lens: bool) -> dict[str, Any]:
-    """The content of the sidecar, which can be applied like any other.
-
-    Pairs are those of the sidecar that was applied, and stay there; so does how far a lens was determined that took
-    none of these images.
-    """
+    """The content of the sidecar, which can be applied like any other; pairs stay in the one that was applied."""
     saved, then = result.saved, result.saved.record
     sources = {index: source for index, source in enumerate(result.sources) if source is not None}
     to_plane = dict(zip(sources, result.placed.homographies, strict=True))
