@@ -139,12 +139,5 @@ def _place(output: OutputRecord) -> Georeference | None:
 
 
 def _residuals(records: Sequence[ResidualRecord]) -> tuple[Residual, ...]:
-    return tuple(
-        Residual(
-            item.name,
-            math.inf if item.east_m is None else item.east_m,
-            math.inf if item.north_m is None else item.north_m,
-            item.used,
-        )
-        for item in records
-    )
+    offs = ([math.inf if off is None else off for off in (item.east_m, item.north_m)] for item in records)
+    return tuple(Residual(item.name, *off, item.used) for item, off in zip(records, offs, strict=True))

@@ -159,7 +159,7 @@ def _pairs(registration: Registration) -> list[PairRecord]:
     names = [source.name for source in registration.sources]
 
     def record(pair: PairRegistration) -> PairRecord:
-        relation, fit = pair.relation, fits.get((pair.image1, pair.image2))
+        relation, fit = pair.relation, fits.get(pair.images)
         return PairRecord(
             images=(names[pair.image1], names[pair.image2]),
             matches=len(pair.matches),
