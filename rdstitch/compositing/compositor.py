@@ -15,7 +15,7 @@ from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.preparation import Decisions, decide, prepare_composite
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.source_images import PlacedImage
-from rdstitch.compositing.tiles import BlockRunner
+from rdstitch.compositing.tiles import BlockRunner, strips_of
 from rdstitch.io.formats import check_format, check_memory
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.strips import ImageSpec
@@ -65,17 +65,17 @@ def compose_decided(
 
     ``elsewhere`` computes the pixels in blocks, in other processes; see :mod:`rdstitch.compositing.tiles`.
     """
-    with prepare_composite(decisions, elsewhere) as prepared:
-        renderer, (width, height) = prepared.renderer, prepared.canvas.size
+    with prepare_composite(decisions, here=elsewhere is None) as tiles:
+        renderer, (width, height) = tiles.renderer, tiles.size
         pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
         alpha = np.zeros((height, width), dtype=np.uint8)
         top = 0
-        with closing(prepared.strips(progress)) as strips:
+        with closing(strips_of(tiles, elsewhere, progress)) as strips:
             for samples, opaque in strips:
                 pixels[top : top + len(samples)], alpha[top : top + len(samples)] = samples, opaque
                 top += len(samples)
     shaped = pixels if renderer.channels > 1 else pixels[..., 0]
-    return Composite(shaped, alpha, prepared.canvas, renderer.exposure, prepared.messages)
+    return Composite(shaped, alpha, decisions.canvas, renderer.exposure, decisions.messages)
 
 
 def compose_to_file(
@@ -93,22 +93,21 @@ def compose_to_file(
     ``extra_tags`` gives further tags of a TIFF file for the canvas after cropping; without ``outputs`` the file
     replaces what is there.
     """
-    with prepare_composite(decisions, elsewhere) as prepared:
-        renderer, size = prepared.renderer, prepared.canvas.size
+    with prepare_composite(decisions, here=elsewhere is None) as tiles:
+        renderer, canvas, size = tiles.renderer, decisions.canvas, tiles.size
         layout = ImageSpec(
             size,
             renderer.channels,
             renderer.dtype,
             transparent=True,
-            metadata=replace(metadata or Metadata(size), xmp=photo_sphere_xmp(prepared.canvas)),
+            metadata=replace(metadata or Metadata(size), xmp=photo_sphere_xmp(canvas)),
             quality=renderer.options.quality,
             background=renderer.options.background,
         )
         check_format(path, layout)
         check_memory(path, size, renderer.options.max_memory)
         # Nothing goes on behind a writer that fails.
-        with closing(prepared.strips(progress)) as strips:
-            tags, workers = extra_tags(prepared.canvas), prepared.tiles.workers
+        with closing(strips_of(tiles, elsewhere, progress)) as strips:
+            tags, workers = extra_tags(canvas), tiles.workers
             written, notes = write_strips(path, layout, strips, tags, outputs=outputs, workers=workers)
-    messages = (*prepared.messages, *notes)
-    return FileComposite(prepared.canvas, written, messages, renderer.seams, prepared.tiles.box[:2])
+    return FileComposite(canvas, written, (*decisions.messages, *notes), renderer.seams, tiles.box[:2])

@@ -54,8 +54,8 @@ class CompositeTables:
         """
         blend = "feather" if options.blend == "multiband" else options.blend
         options = replace(options, blend=blend, crop="none")
-        with prepare_composite(decide(images, canvas, options)) as prepared:
-            renderer, box = prepared.renderer, prepared.tiles.box
+        with prepare_composite(decide(images, canvas, options)) as tiles:
+            renderer, box = tiles.renderer, tiles.box
             covered = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.uint8)
             exposure, channels = renderer.exposure, renderer.channels
             offset = np.zeros((*covered.shape, channels), dtype=np.float32) if exposure.offset else None

@@ -70,12 +70,12 @@ def stage_layers(result: OutputImage, files: Mapping[str, tuple[Path, Path]], ou
     """Stage the layer and the mask of each image of a result, whose names say the files."""
     images = result.placed.images(result.canvas.near)
     task = decide(images, result.canvas, replace(result.options.composite, crop="none"))
-    with prepare_composite(task) as prepared:
-        canvas = prepared.tiles.box
+    with prepare_composite(task) as tiles:
+        canvas = tiles.box
         size = canvas[2] - canvas[0], canvas[3] - canvas[1]
-        for index, (source, warp) in enumerate(zip(result.placed.sources, prepared.renderer.warps, strict=True)):
+        for index, (source, warp) in enumerate(zip(result.placed.sources, tiles.renderer.warps, strict=True)):
             box = canvas if whole else intersection(warp.box, canvas) or canvas
-            samples, covered, mask = prepared.renderer.layer(index, box)
+            samples, covered, mask = tiles.renderer.layer(index, box)
             offset = box[0] - canvas[0], box[1] - canvas[1]
             shift = np.array([[1.0, 0.0, -offset[0]], [0.0, 1.0, -offset[1]], [0.0, 0.0, 1.0]])
             tags = () if result.georeference is None else result.georeference.after(shift).tiff_tags()
