@@ -160,7 +160,8 @@ def metadata_of(image: Image.Image) -> Metadata:
     """Metadata of an image that Pillow has opened."""
     # First, since looking for EXIF at the end of a PNG file decodes it, and Pillow then forgets.
     bit_depth = stored_bits(image)
-    return _metadata(image.getexif(), image.info, image.size, bit_depth, _channels(image))
+    channels = (1 if is_grey(image) else 3) + is_transparent(image)
+    return _metadata(image.getexif(), image.info, image.size, bit_depth, channels)
 
 
 def _metadata(
@@ -207,11 +208,6 @@ def _colour_profile(profile: object) -> tuple[bytes, str]:
     if profile[_COLOUR_SPACE] == b"Lab ":
         return b"", ""
     return profile, ""
-
-
-def _channels(image: Image.Image) -> int:
-    """Samples per pixel of what it is decoded to, with alpha."""
-    return (1 if is_grey(image) else 3) + is_transparent(image)
 
 
 def is_transparent(image: Image.Image) -> bool:

@@ -192,17 +192,6 @@ def test_damaged_files_are_named(tmp_path: Path, name: str) -> None:
             read(tmp_path / name)
 
 
-def test_of_an_image_in_two_formats_the_usual_one_is_taken(tmp_path: Path) -> None:
-    _smooth().save(tmp_path / "a.jpg")
-    (tmp_path / "A.CR2").write_bytes(b"the same")
-    (tmp_path / "notes.txt").touch()
-    found = find_images([tmp_path])
-    assert [frame.path.name for frame in found.frames] == ["a.jpg"]
-    versions, others = (message.text for message in found.messages)
-    assert versions.endswith("are raw or HEIC versions of images that are taken: A.CR2")
-    assert others.endswith("not taken for images: notes.txt")
-
-
 @pytest.mark.parametrize(("name", "shape"), [("a.png", (100, 100, 4)), ("a.tif", (60, 100, 200))])
 def test_the_limit_of_memory_knows_channels_and_depth(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, shape: tuple[int, int, int]
