@@ -13,15 +13,17 @@ from rdstitch.geometry.exif_orientation import turned_size, turning_matrix
 from rdstitch.geometry.places import GpsPosition
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_text
 from rdstitch.io.colour import ink_transform
-from rdstitch.io.exif_edit import author_and_time, upright_exif, without_film_size
-from rdstitch.io.exif_tags import (
+from rdstitch.io.exif import (
     ORIENTATION,
+    author_and_time,
     exposure_of,
     focal_length,
     gps_position,
     orientation_of,
     tag_text,
     time_taken,
+    upright_exif,
+    without_film_size,
 )
 from rdstitch.io.ome import read_ome
 from rdstitch.io.opening import (
