@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.features.keypoints import Features
-from rdstitch.features.learned import AlikedDetection
+from rdstitch.features.keypoints import Detection, Features
+from rdstitch.features.learned import detect_aliked
 from rdstitch.features.opencv import OpenCVDetection
 from rdstitch.features.prepared_image import CLIP_LIMIT, Mask, PixelArray, PreparedImage, View, prepare
-from rdstitch.features.sift_tiles import LARGE, SiftTilesDetection
-from rdstitch.features.surf.descriptor import SurfDetection
+from rdstitch.features.sift_tiles import LARGE, detect_sift_in_tiles
+from rdstitch.features.surf.descriptor import detect_surf
 from rdstitch.options.feature_options import CLOSER, FeatureOptions
 
 _MIN_KEYPOINT_FRACTION = 0.5  # of the keypoints wanted: where a reduced image shows fewer, a larger one is used
@@ -20,18 +20,15 @@ _SPREAD_CELL = 0.05  # side of a cell over which keypoints are spread, diagonals
 # Fraction of the keypoints that must be seen at less contrast, too; of fewer, contrast is what is missing.
 _LASTING = 0.5
 
-Detection = SurfDetection | AlikedDetection | SiftTilesDetection | OpenCVDetection
-"""Keypoints of one image, not yet described; always in the same order for the same image."""
 
-
-def find(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection:
+def find(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection | OpenCVDetection:
     """Find the keypoints of an image by the detector that the options name."""
     if options.kind == "surf":
-        return SurfDetection.find(grey)
+        return detect_surf(grey)
     if options.kind == "aliked":
-        return AlikedDetection.find(grey, options)
+        return detect_aliked(grey, options)
     if options.kind in ("sift", "rootsift") and grey.size > LARGE:
-        return SiftTilesDetection.find(grey, options)
+        return detect_sift_in_tiles(grey, options)
     return OpenCVDetection.find(grey, options)
 
 
@@ -105,13 +102,13 @@ def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
 
 def _find(
     source: ViewLoader, options: FeatureOptions, megapixels: float | None
-) -> tuple[PreparedImage, Detection, NDArray[np.intp]]:
+) -> tuple[PreparedImage, Detection | OpenCVDetection, NDArray[np.intp]]:
     """The image at most so large, the keypoints detected in it, and which of them keep clear of the mask."""
     image = prepare(source(megapixels), megapixels, stretch=options.stretch, equalize=bool(options.equalize))
     detection = find(image.grey, options)
     return image, detection, _usable(image, detection)
 
 
-def _usable(image: PreparedImage, detection: Detection) -> NDArray[np.intp]:
+def _usable(image: PreparedImage, detection: Detection | OpenCVDetection) -> NDArray[np.intp]:
     """Select the keypoints that keep clear of the mask."""
     return np.flatnonzero(image.covers(detection.points, detection.scale / 2))

@@ -18,7 +18,7 @@ _SURER = 0.5  # of the standard deviation of all lengths that earlier frames wer
 
 def check_camera(keyframe_map: KeyframeMap, latest: Frame) -> CameraRevision | None:
     """What the keyframes show of a camera whose lens and focal length are given; None where it is not looked at."""
-    knowledge, has_plane = keyframe_map.knowledge, keyframe_map.state.has_plane
+    knowledge, has_plane = keyframe_map.knowledge, keyframe_map.has_plane
     if knowledge.focal is None or not knowledge.is_metric(latest.camera) or knowledge.model not in ("auto", "rigid"):
         return None
     if not keyframe_map.links or (has_plane and keyframe_map.seen not in _CHECKS and keyframe_map.seen % _INTERVAL):

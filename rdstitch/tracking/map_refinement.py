@@ -70,15 +70,13 @@ class MapRefinement:
         grown = max(2, round(self._next * (_GROWTH - 1.0)))
         self._next += _INTERVAL if lens_known else min(grown, _INTERVAL)
         # At a keyframe and not when it is done: so that time does not decide on the result.
-        self._taken_over_at = keyframe_map.seen + (
-            _DELAY if lens_known and keyframe_map.state.has_plane else _FIRST_DELAY
-        )
+        self._taken_over_at = keyframe_map.seen + (_DELAY if lens_known and keyframe_map.has_plane else _FIRST_DELAY)
         self.begin(keyframe_map)
 
     def begin(self, keyframe_map: KeyframeMap) -> None:
         """Begin to align the last keyframes among themselves."""
         window, knowledge, keeps_focal = list(keyframe_map.keyframes), keyframe_map.knowledge, keyframe_map.keeps_focal
-        executor = self._executor if keyframe_map.state.has_plane else self._first_executor
+        executor = self._executor if keyframe_map.has_plane else self._first_executor
         frames = [keyframe.frame for keyframe in window]
         options = replace(knowledge.options_for(frames), max_matches_per_link=_MATCHES, reference=None)
         cameras = knowledge.cameras_for(frames, _EXACT if keeps_focal else None)

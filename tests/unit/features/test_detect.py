@@ -19,7 +19,7 @@ from rdstitch.features.crossings import find_crossings
 from rdstitch.features.detect import spread, strongest
 from rdstitch.features.opencv import OpenCVDetection
 from rdstitch.features.prepared_image import common_stretch, halving, prepare, usual_stretch
-from rdstitch.features.sift_tiles import SiftTilesDetection
+from rdstitch.features.sift_tiles import detect_sift_in_tiles
 from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic import ImageTexture, Photometry, grid_poses, ground, sequence_over
 from tests.cli.running import flight
@@ -269,7 +269,7 @@ def grey() -> NDArray[np.uint8]:
 
 def test_keypoints_of_tiles_are_those_of_the_whole(grey: NDArray[np.uint8]) -> None:
     """No fine one is lost, or found twice, where tiles meet; and each is described as in the whole."""
-    whole, tiles = OpenCVDetection.find(grey, OPTIONS), SiftTilesDetection.find(grey, OPTIONS)
+    whole, tiles = OpenCVDetection.find(grey, OPTIONS), detect_sift_in_tiles(grey, OPTIONS)
     fine, small = (np.flatnonzero(found.scale < 6.5) for found in (whole, tiles))
     assert len(fine) == len(small) > 3000
     distance, partner = map(np.asarray, cKDTree(tiles.points[small]).query(whole.points[fine]))
