@@ -5,6 +5,7 @@ taken near each other, and that look alike. Of these, each image is registered w
 and once poses are known, with those that the poses put beside it and that close a loop.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import combinations, islice
 
@@ -41,18 +42,17 @@ Pairs = list[tuple[int, int]]
 def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None = None) -> Pairs:
     """Pairs (i, j), i < j, to try before anything is known of the poses.
 
-    Beyond :data:`EXHAUSTIVE_UP_TO` images, they are at most :data:`CANDIDATES` an image in the mean, unless
-    positions ask for more: images that follow one another where the order means something, those that were taken
-    nearest to each other, a few that each image is most alike to, and those that are most alike of all.
-
-    ``features``: of the images, in the order in which the images were taken, if there is one; ``positions`` (N, 2) or
-    (N, 3): where each image was taken, in any unit; NaN where that is not known.
+    Beyond :data:`EXHAUSTIVE_UP_TO` images, they are images that follow one another where the order means something,
+    those taken nearest to each other by ``positions`` (N, 2 or 3; NaN where not known), a few that each image is most
+    alike to, and those most alike of all, until there are :data:`CANDIDATES` an image in the mean.
     """
     count = len(features)
     if count <= EXHAUSTIVE_UP_TO:
         return list(combinations(range(count), 2))
     alike = similarity(features, seed)
-    chosen = set() if positions is None else _nearest_positions(positions)
+    chosen = set[tuple[int, int]]()
+    if positions is not None and len(known := np.flatnonzero(np.isfinite(positions).all(axis=1))) > 1:
+        chosen |= _nearest_pairs(positions[known], known, _NEAREST)
     if alike is None or alike.ordered:
         chosen |= {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + _SEQUENCE_NEIGHBOURS, count))}
     if alike is not None:
@@ -68,16 +68,8 @@ def _most_alike(alike: Similarity, chosen: set[tuple[int, int]], total: int) -> 
     scores = sparse.triu(alike.scores, k=1).tocoo()
     best = np.argsort(-scores.data, kind="stable")
     best = best[scores.data[best] > 0.0]
-    others = (pair for pair in zip(scores.row[best].tolist(), scores.col[best].tolist(), strict=True))
-    return set(islice((pair for pair in others if pair not in chosen), max(total - len(chosen), 0)))
-
-
-def _nearest_positions(positions: FloatArray) -> set[tuple[int, int]]:
-    """Pairs of images that were taken nearest to each other."""
-    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
-    if len(known) < 2:
-        return set()
-    return _nearest_pairs(positions[known], known, _NEAREST)
+    ranked = zip(scores.row[best].tolist(), scores.col[best].tolist(), strict=True)
+    return set(islice((pair for pair in ranked if pair not in chosen), max(total - len(chosen), 0)))
 
 
 def _nearest_pairs(places: FloatArray, images: IntArray, most: int) -> set[tuple[int, int]]:
@@ -95,16 +87,14 @@ def select_pairs(
     An image takes one partner after the other: the one whose matches add most to the sum of the square roots of the
     numbers of matches in its cells. So partners with many matches come first, but rather around the image than
     all on one side of it. Of a survey in which each image overlaps twenty others, a third of the pairs is left.
-
-    ``shared``: some matches of each pair (i, j); ``cameras``: one an image; only their sizes are used.
     """
-    partners: dict[int, list[tuple[tuple[int, int], FloatArray]]] = {}
+    partners = defaultdict[int, list[tuple[tuple[int, int], FloatArray]]](list)
     for pair, matches in shared.items():
         matched = matches.load()
         for image, points in zip(pair, (matched.points1, matched.points2), strict=True):
             cell = np.clip(points / cameras[image].image_size * _CELLS_PER_SIDE, 0, _CELLS_PER_SIDE - 1).astype(np.intp)
             counts = np.bincount(cell @ [1, _CELLS_PER_SIDE], minlength=_CELLS_PER_SIDE**2)
-            partners.setdefault(image, []).append((pair, counts.astype(np.float64)))
+            partners[image].append((pair, counts.astype(np.float64)))
     chosen: set[tuple[int, int]] = set()
     for choices in partners.values():
         counts, covered = np.array([cells for _, cells in choices]), np.zeros(_CELLS_PER_SIDE**2)
@@ -121,9 +111,8 @@ def loop_closures(
     """Pairs that the poses put over one another and that were not tried yet, where the match graph needs them.
 
     It does not need a pair of images that both have their partners, one of them in common: that closes no loop.
-
-    ``homographies`` (N, 3, 3): from undistorted normalized coordinates of each image to the plane, or to directions;
-    NaN for images without a pose; ``tried``: pairs (i, j), i < j; ``on_sphere``: whether they lead to directions.
+    ``homographies`` (N, 3, 3) lead from undistorted normalized coordinates to the plane, or to directions
+    (``on_sphere``); NaN for images without a pose.
     """
     middles = homographies[:, :, 2]
     with np.errstate(invalid="ignore"):
@@ -133,14 +122,13 @@ def loop_closures(
         return []
     size = np.linalg.norm(middles[known], axis=1) if on_sphere else middles[known, 2]
     centres = middles[known] / size[:, None]
-    partners: dict[int, set[int]] = {}
+    partners = defaultdict[int, set[int]](set)
     for i, j in tried:
-        partners.setdefault(i, set()).add(j)
-        partners.setdefault(j, set()).add(i)
+        partners[i].add(j)
+        partners[j].add(i)
 
     def needed(i: int, j: int) -> bool:
-        first, second = partners.get(i, set()), partners.get(j, set())
-        return min(len(first), len(second)) < _PARTNERS or not first & second
+        return min(len(partners[i]), len(partners[j])) < _PARTNERS or not partners[i] & partners[j]
 
     pairs = [pair for pair in sorted(_nearest_pairs(centres, known, _NEIGHBOURS) - tried) if needed(*pair)]
     both = np.array([*pairs, *(pair[::-1] for pair in pairs)], dtype=np.intp).reshape(-1, 2)

@@ -66,13 +66,6 @@ def _spread(values: FloatArray, distortion: FloatArray) -> FloatArray:
     return values.reshape(*values.shape[:-1], *[1] * (distortion.ndim - 1), values.shape[-1])
 
 
-def rays(points: FloatArray, distortion: FloatArray, focal: FloatArray | float = 1.0) -> FloatArray:
-    """Unit rays (3, 2, k, b) of points (2, 2, k, b) for one λ and one focal length a sample."""
-    directions = np.concatenate([points, (focal * (1.0 + distortion * squared_radii(points)))[None]])
-    unit: FloatArray = directions / np.sqrt((directions * directions).sum(axis=0))
-    return unit
-
-
 def rotation_of_two(bundle: FloatArray) -> FloatArray:
     """Rotations (b, 3, 3) that turn the rays of image 1 to those of image 2 best, for unit rays (3, 2, 2, b).
 
@@ -86,13 +79,6 @@ def rotation_of_two(bundle: FloatArray) -> FloatArray:
     return rotation
 
 
-def with_focal(rotation: FloatArray, focal: FloatArray) -> FloatArray:
-    """``K R K⁻¹``, ``K = diag(g, g, 1)``, of rotations (b, 3, 3) and focal lengths (b,)."""
-    k = np.stack([focal, focal, np.ones_like(focal)], axis=-1)
-    homography: FloatArray = rotation * (k[:, :, None] / k[:, None, :])
-    return homography
-
-
 def turned_solutions(
     points: FloatArray,
     sample: IndexArray,
@@ -101,12 +87,13 @@ def turned_solutions(
     rotate: Callable[[FloatArray], FloatArray],
 ) -> Solutions:
     """Solutions from λ and focal lengths (b,) of points (2, 2, k, b); those that leave a point behind are left out."""
-    bundle = rays(points, distortion, focal)
+    bundle = _unit(np.concatenate([points, (focal * (1.0 + distortion * squared_radii(points)))[None]]))
     rotation = rotate(bundle)
     # In front of the camera of image 2, whatever the errors of a sample that no rotation fits.
     ahead = np.einsum("bj,jkb->kb", rotation[:, 2], bundle[:, 0])
     kept = np.flatnonzero((ahead > 0.0).all(axis=0) & np.isfinite(rotation).all(axis=(1, 2)))
-    homography = with_focal(rotation[kept], focal[kept])
+    k = np.stack([focal, focal, np.ones_like(focal)], axis=-1)[kept]
+    homography = rotation[kept] * (k[:, :, None] / k[:, None, :])  # K R K⁻¹ with K = diag(g, g, 1)
     return Solutions(sample[kept], homography, distortion[kept], focal[kept])
 
 

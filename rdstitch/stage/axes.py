@@ -116,12 +116,12 @@ def _across(nominal: FloatArray, other: FloatArray, other_measured: FloatArray) 
 
 def _in_words(steps: Mapping[int, tuple[FloatArray, FloatArray]], size: tuple[int, int]) -> str:
     """What is not as it was given, by nominal and measured steps of each axis: directions, and overlaps."""
-    said, overlaps = [], []
+    differences, overlaps = [], []
     for k, (nominal, measured) in steps.items():
         along = int(np.abs(measured).argmax())
         if along != k:
-            said.append(f"{('columns', 'rows')[k]} lie {'below' if along else 'beside'} each other")
+            differences.append(f"{('columns', 'rows')[k]} lie {'below' if along else 'beside'} each other")
         if measured[along] * nominal[k] < 0.0:
-            said.append(f"the next {('column', 'row')[k]} is {('left', 'above')[along]}")
+            differences.append(f"the next {('column', 'row')[k]} is {('left', 'above')[along]}")
         overlaps.append(f"{100.0 * (1.0 - abs(measured[along]) / size[along]):.1f}")
-    return f"{', '.join([*said, ''])}neighbours overlap by {' and '.join(overlaps)} %"
+    return f"{', '.join([*differences, ''])}neighbours overlap by {' and '.join(overlaps)} %"

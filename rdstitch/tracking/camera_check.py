@@ -11,7 +11,7 @@ from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.metric_plane import MetricPlane
 from rdstitch.tracking.tracked_frame import Frame
 
-_CHECKS = 3, 4, 6, 8, 12, 16, 32  # keyframes at which a map with a plane is looked at, and at each _INTERVAL
+_CHECKS = 3, 4, 6, 8, 12, 16, 32  # keyframes after the first at which a map with a plane is checked, and each _INTERVAL
 _INTERVAL = 24
 _SURER = 0.5  # of the standard deviation of all lengths that earlier frames were given with: they come again
 
@@ -21,7 +21,7 @@ def check_camera(keyframe_map: KeyframeMap, latest: Frame) -> CameraRevision | N
     knowledge, has_plane = keyframe_map.knowledge, keyframe_map.has_plane
     if knowledge.focal is None or not knowledge.is_metric(latest.camera) or knowledge.model not in ("auto", "rigid"):
         return None
-    if not keyframe_map.links or (has_plane and keyframe_map.seen not in _CHECKS and keyframe_map.seen % _INTERVAL):
+    if not keyframe_map.links or (has_plane and keyframe_map.added not in _CHECKS and keyframe_map.added % _INTERVAL):
         return None
     estimate = _estimate(keyframe_map, knowledge.focal)
     revision = CameraRevision(

@@ -42,7 +42,7 @@ class KeyframeMap:
     between: deque[tuple[TrackedFrame, TrackedFrame, FloatArray, FloatArray]] = field(
         default_factory=lambda: deque(maxlen=_REVISED)
     )
-    seen: int = 0  # keyframes after the first
+    added: int = 0  # keyframes after the first
     searched: int = 0  # keyframes among which a lost frame has looked for its place
 
     def add(self, frame: TrackedFrame, links: Sequence[Link]) -> None:
@@ -52,7 +52,7 @@ class KeyframeMap:
         frame.keyframe = True
         self.older = [*self.older, *self.keyframes[: -_WINDOW + 1]][-_KEPT:]
         self.keyframes = [*self.keyframes, frame][-_WINDOW:]
-        self.seen += 1
+        self.added += 1
         kept = {keyframe.number for keyframe in self.keyframes}
         self.links = [link for link in (*self.links, *links) if link.image1 in kept and link.image2 in kept]
 

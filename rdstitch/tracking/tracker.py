@@ -24,7 +24,7 @@ from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.map_refinement import MapRefinement
 from rdstitch.tracking.odometry_prediction import OdometryPrediction
 from rdstitch.tracking.placement import Placement
-from rdstitch.tracking.tracked_frame import Frame, FramePlace, TrackedFrame, TrackingResult
+from rdstitch.tracking.tracked_frame import NO_IMAGE, Frame, FramePlace, TrackedFrame, TrackingResult
 
 _PATIENCE = 0.015  # seconds a frame that are waited for the first alignment
 _KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below which it becomes a keyframe
@@ -105,7 +105,7 @@ class FrameTracker:
         if placed.place.pose is not None and frame.body is not None:
             self._odometry.latest = placed
         if not placed.keyframe:
-            placed.frame = frame.without_image()
+            placed.frame = replace(frame, image=NO_IMAGE)
         return results
 
     def _first(self, frame: Frame, map_number: int) -> TrackingResult:
@@ -187,7 +187,7 @@ class FrameTracker:
         revised = self._with_checked_camera(placed)
         if placed.frame.body is not None:
             self._odometry.learn(self._map.by_number.values())
-        if self._refinement.is_waited_for(self._map.seen):
+        if self._refinement.is_waited_for(self._map.added):
             revised += self._take_over(placed, None)
         self._refinement.begin_if_due(self._map)
         return revised

@@ -117,27 +117,15 @@ def _describe(patches: NDArray[np.float32]) -> NDArray[np.float32]:
     du = (down[:, :, 1:] - down[:, :, :-1]) * _RESPONSE_WEIGHTS
     right = patches[:, :, 1:] + patches[:, :, :-1]
     dv = (right[:, 1:] - right[:, :-1]) * _RESPONSE_WEIGHTS
-    cells = np.stack([_cell_sums(values) for values in (du, dv, np.abs(du), np.abs(dv))], axis=-1).reshape(
-        len(patches), -1
-    )
+    parts = np.stack([du, dv, np.abs(du), np.abs(dv)]).reshape(4, -1, _CELLS, _SAMPLES, _CELLS, _SAMPLES)
+    cells: NDArray[np.float32] = np.moveaxis(parts.sum(axis=3).sum(axis=4), 0, -1).reshape(len(patches), -1)
     norm: NDArray[np.float32] = np.sqrt((cells**2).sum(axis=1, keepdims=True))
     return np.divide(cells, norm, out=np.zeros_like(cells), where=norm > 0)
 
 
-def _cell_sums(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Sums over cells, (N, 20, 20) to (N, 16)."""
-    cells = values.reshape(-1, _CELLS, _SAMPLES, _CELLS, _SAMPLES)
-    total: NDArray[np.float32] = cells.sum(axis=2).sum(axis=3).reshape(-1, _CELLS**2)
-    return total
-
-
-def _response_weights() -> NDArray[np.float32]:
-    """Gaussian weight of each response, shape (20, 20)."""
-    place = np.arange(_SIDE) - (_SIDE - 1) / 2
-    return np.exp(-(place[:, None] ** 2 + place**2) / (2 * _RESPONSE_SIGMA**2)).astype(np.float32)
-
-
-_RESPONSE_WEIGHTS = _response_weights()
+_PLACE = np.arange(_SIDE) - (_SIDE - 1) / 2
+_RESPONSE_WEIGHTS = np.exp(-(_PLACE[:, None] ** 2 + _PLACE**2) / (2 * _RESPONSE_SIGMA**2)).astype(np.float32)
+"""Gaussian weight of each response, (20, 20)."""
 
 
 def detect_surf(grey: Grey) -> Detection:

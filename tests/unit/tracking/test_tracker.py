@@ -340,7 +340,7 @@ def test_keyframes_by_odometry_are_no_measurement_of_it() -> None:
 
 
 def test_keyframes_without_links_show_nothing_of_the_camera() -> None:
-    keyframe_map = KeyframeMap(_given_camera(), [_keyframe(23), _keyframe(24)], has_plane=True, seen=24)
+    keyframe_map = KeyframeMap(_given_camera(), [_keyframe(23), _keyframe(24)], has_plane=True, added=24)
     assert check_camera(keyframe_map, keyframe_map.keyframes[-1].frame) is None
 
 
