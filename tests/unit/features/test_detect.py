@@ -330,9 +330,9 @@ def test_what_is_masked_or_shows_nothing_has_none() -> None:
 
 
 @pytest.mark.parametrize(("kind", "bytes_each"), [("rootsift", (1, 2)), ("sift", (1,)), ("orb", (1,)), ("surf", (2,))])
-def test_packed_features_match_as_before(kind: FeatureName, bytes_each: tuple[int, ...]) -> None:
-    colour = ground((320, 240), 11, 1).region(0, 0, 320, 240)
-    image = np.rint(cv2.GaussianBlur(colour, (0, 0), 1.0).reshape(240, 320) * 255).astype(np.uint8)
+def test_packed_features_match_as_before(
+    kind: FeatureName, bytes_each: tuple[int, ...], image: NDArray[np.uint8]
+) -> None:
     options = FeatureOptions(kind=kind, max_features=500)
     features = [detect(image, options), detect(np.ascontiguousarray(image[:, 40:]), options)]
     packed = [PackedFeatures.pack(found) for found in features]
