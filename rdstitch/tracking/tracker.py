@@ -17,7 +17,7 @@ from rdstitch.inputs.odometry import BodyPose
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
-from rdstitch.tracking.camera_check import check_camera
+from rdstitch.tracking.camera_check import revise_camera
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.frame_links import agree
 from rdstitch.tracking.keyframe_map import KeyframeMap
@@ -194,14 +194,11 @@ class FrameTracker:
 
     def _with_checked_camera(self, latest: TrackedFrame) -> list[TrackingResult]:
         """Earlier frames whose places are others, or surer, by what keyframes show of a camera that was given."""
-        revision = check_camera(self._map, latest.frame)
-        if revision is None:
-            return []
+        focal, revision = self._knowledge.focal, revise_camera(self._map, latest.frame)
         for message in revision.messages:
             self._report(message)
-        if revision.focal != self._knowledge.focal:
+        if self._knowledge.focal != focal:
             self._refinement.drop()
-        self._knowledge.revise(revision)
         if revision.length_factor is not None:
             self._map.rescale(revision.length_factor)
         elif not revision.report_again:

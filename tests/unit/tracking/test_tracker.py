@@ -34,7 +34,7 @@ from rdstitch.tracking import (
     TrackingResult,
     map_refinement,
 )
-from rdstitch.tracking.camera_check import check_camera
+from rdstitch.tracking.camera_check import CameraRevision, revise_camera
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.map_refinement import MapRefinement
@@ -341,7 +341,7 @@ def test_keyframes_by_odometry_are_no_measurement_of_it() -> None:
 
 def test_keyframes_without_links_show_nothing_of_the_camera() -> None:
     keyframe_map = KeyframeMap(_given_camera(), [_keyframe(23), _keyframe(24)], has_plane=True, added=24)
-    assert check_camera(keyframe_map, keyframe_map.keyframes[-1].frame) is None
+    assert revise_camera(keyframe_map, keyframe_map.keyframes[-1].frame) == CameraRevision()
 
 
 def test_an_alignment_that_is_dropped_keeps_no_worker_busy() -> None:
