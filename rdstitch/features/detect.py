@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Detection, Features
 from rdstitch.features.learned import detect_aliked
-from rdstitch.features.opencv import OpenCVDetection
+from rdstitch.features.opencv import detect_opencv
 from rdstitch.features.prepared_image import CLIP_LIMIT, Mask, PixelArray, PreparedImage, View, prepare
 from rdstitch.features.sift_tiles import LARGE, detect_sift_in_tiles
 from rdstitch.features.surf.descriptor import detect_surf
@@ -21,7 +21,7 @@ _SPREAD_CELL = 0.05  # side of a cell over which keypoints are spread, diagonals
 _LASTING = 0.5
 
 
-def find(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection | OpenCVDetection:
+def find(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection:
     """Find the keypoints of an image by the detector that the options name."""
     if options.kind == "surf":
         return detect_surf(grey)
@@ -29,7 +29,7 @@ def find(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection | OpenCV
         return detect_aliked(grey, options)
     if options.kind in ("sift", "rootsift") and grey.size > LARGE:
         return detect_sift_in_tiles(grey, options)
-    return OpenCVDetection.find(grey, options)
+    return detect_opencv(grey, options)
 
 
 def strongest(response: FloatArray, count: int) -> NDArray[np.intp]:
@@ -102,13 +102,13 @@ def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
 
 def _find(
     source: ViewLoader, options: FeatureOptions, megapixels: float | None
-) -> tuple[PreparedImage, Detection | OpenCVDetection, NDArray[np.intp]]:
+) -> tuple[PreparedImage, Detection, NDArray[np.intp]]:
     """The image at most so large, the keypoints detected in it, and which of them keep clear of the mask."""
     image = prepare(source(megapixels), megapixels, stretch=options.stretch, equalize=bool(options.equalize))
     detection = find(image.grey, options)
     return image, detection, _usable(image, detection)
 
 
-def _usable(image: PreparedImage, detection: Detection | OpenCVDetection) -> NDArray[np.intp]:
+def _usable(image: PreparedImage, detection: Detection) -> NDArray[np.intp]:
     """Select the keypoints that keep clear of the mask."""
     return np.flatnonzero(image.covers(detection.points, detection.scale / 2))

@@ -84,6 +84,11 @@ class Detection:
     response: FloatArray  # (N,): strengths, in units of the detector
     describe: Callable[[NDArray[np.intp]], Features]  # features of the keypoints of some indices
 
+    def take(self, index: NDArray[np.intp]) -> "Detection":
+        """The keypoints of the given indices, in their order."""
+        points, scale, response = self.points[index], self.scale[index], self.response[index]
+        return Detection(points, scale, response, lambda chosen: self.describe(index[chosen]))
+
 
 @dataclass(frozen=True, eq=False)
 class PackedFeatures:

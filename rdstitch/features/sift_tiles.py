@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Detection, Features
-from rdstitch.features.opencv import Grey, OpenCVDetection
+from rdstitch.features.opencv import Grey, detect_opencv
 from rdstitch.options.feature_options import FeatureOptions
 
 LARGE = 1_250_000
@@ -46,7 +46,7 @@ def detect_sift_in_tiles(grey: Grey, options: FeatureOptions) -> Detection:
     return Detection(points, scale, response, describe)
 
 
-def _in_whole(part: OpenCVDetection, corner: NDArray[np.intp], factor: FloatArray) -> Detection:
+def _in_whole(part: Detection, corner: NDArray[np.intp], factor: FloatArray) -> Detection:
     """Keypoints of a tile in pixels of the image itself, of which ``factor`` (2,) are one of the tile.
 
     ``corner`` (2,) is the tile's in the image that it is cut from. Strengths are contrast times diameter.
@@ -58,7 +58,7 @@ def _in_whole(part: OpenCVDetection, corner: NDArray[np.intp], factor: FloatArra
         scale, response = found.scale * enlargement, found.response * enlargement
         return replace(found, points=points, scale=scale, response=response)
 
-    return moved(Detection(part.points, part.scale, part.response, lambda chosen: moved(part.describe(chosen))))
+    return moved(replace(part, describe=lambda chosen: moved(part.describe(chosen))))
 
 
 def _parts(grey: Grey, options: FeatureOptions) -> Iterator[Detection]:
@@ -73,19 +73,16 @@ def _parts(grey: Grey, options: FeatureOptions) -> Iterator[Detection]:
         grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         if grey.size <= LARGE:
             break
-    detection = OpenCVDetection.find(grey, options)
-    coarse = np.flatnonzero(_octave(detection) != _UPSAMPLED)
-    yield _in_whole(detection.take(coarse), np.zeros(2, dtype=np.intp), whole / grey.shape[::-1])
+    coarse = detect_opencv(grey, options, range(_UPSAMPLED))
+    yield _in_whole(coarse, np.zeros(2, dtype=np.intp), whole / grey.shape[::-1])
 
 
 def _tiles(grey: Grey, factor: FloatArray, octaves: list[int], options: FeatureOptions) -> Iterator[Detection]:
     """Find the keypoints of some octaves, tile by tile."""
     for y in _intervals(grey.shape[0]):
         for x in _intervals(grey.shape[1]):
-            detection = OpenCVDetection.find(grey[y.seen, x.seen], options)
-            inside = (
-                x.owns(detection.points[:, 0]) & y.owns(detection.points[:, 1]) & np.isin(_octave(detection), octaves)
-            )
+            detection = detect_opencv(grey[y.seen, x.seen], options, octaves)
+            inside = x.owns(detection.points[:, 0]) & y.owns(detection.points[:, 1])
             yield _in_whole(detection.take(np.flatnonzero(inside)), np.array([x.seen.start, y.seen.start]), factor)
 
 
@@ -115,8 +112,3 @@ def _intervals(length: int) -> list[_Interval]:
         )
         for start, stop in pairwise(borders)
     ]
-
-
-def _octave(detection: OpenCVDetection) -> NDArray[np.intp]:
-    """The octave of each keypoint, as OpenCV packs it."""
-    return np.array([keypoint.octave & 255 for keypoint in detection.keypoints], dtype=np.intp)

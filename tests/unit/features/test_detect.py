@@ -17,7 +17,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.features import FeatureOptions, Features, PackedFeatures, View, detect, detect_view, match
 from rdstitch.features.crossings import find_crossings
 from rdstitch.features.detect import spread, strongest
-from rdstitch.features.opencv import OpenCVDetection
+from rdstitch.features.opencv import detect_opencv
 from rdstitch.features.prepared_image import common_stretch, halving, prepare, usual_stretch
 from rdstitch.features.sift_tiles import detect_sift_in_tiles
 from rdstitch.geometry.camera import Camera
@@ -269,7 +269,7 @@ def grey() -> NDArray[np.uint8]:
 
 def test_keypoints_of_tiles_are_those_of_the_whole(grey: NDArray[np.uint8]) -> None:
     """No fine one is lost, or found twice, where tiles meet; and each is described as in the whole."""
-    whole, tiles = OpenCVDetection.find(grey, OPTIONS), detect_sift_in_tiles(grey, OPTIONS)
+    whole, tiles = detect_opencv(grey, OPTIONS), detect_sift_in_tiles(grey, OPTIONS)
     fine, small = (np.flatnonzero(found.scale < 6.5) for found in (whole, tiles))
     assert len(fine) == len(small) > 3000
     distance, partner = map(np.asarray, cKDTree(tiles.points[small]).query(whole.points[fine]))
