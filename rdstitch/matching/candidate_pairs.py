@@ -1,12 +1,14 @@
 """Which pairs of images to match, so that the cost does not grow with the square of their number.
 
 Up to :data:`EXHAUSTIVE_UP_TO` images every pair is compared. Beyond, images that follow one another, that were
-taken near each other, and that look alike. Of these, each image is registered with those that matter for its place;
-and once poses are known, with those that the poses put beside it and that close a loop.
+taken near each other, and that look alike. Of these, those that share something by their strongest features alone, and
+that matter for the place of an image; and once poses are known, those that the poses put beside it and that close a
+loop.
 """
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations, islice
 
 import numpy as np
@@ -16,7 +18,9 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import project
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
+from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.retrieval import Similarity, similarity
+from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.system.late_imports import sparse
 
 EXHAUSTIVE_UP_TO = 30
@@ -36,10 +40,12 @@ _CELLS_PER_SIDE = 4  # cells of an image, a side, that its partners are to cover
 
 _PAIRS_AT_ONCE = 1024
 
-Pairs = list[tuple[int, int]]
+_STRONGEST = 500  # features of an image, by which pairs are prescreened
+_MIN_MATCHES = 6  # matches among these; images that share nothing have two to five by chance
+_MIN_RELATIVE_MATCHES = 0.05  # fraction of the matches that an image has with the one most like it; less adds nothing
 
 
-def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None = None) -> Pairs:
+def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None = None) -> list[Pair]:
     """Pairs (i, j), i < j, to try before anything is known of the poses.
 
     Beyond :data:`EXHAUSTIVE_UP_TO` images, they are images that follow one another where the order means something,
@@ -50,7 +56,7 @@ def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None 
     if count <= EXHAUSTIVE_UP_TO:
         return list(combinations(range(count), 2))
     alike = similarity(features, seed)
-    chosen = set[tuple[int, int]]()
+    chosen = set[Pair]()
     if positions is not None and len(known := np.flatnonzero(np.isfinite(positions).all(axis=1))) > 1:
         chosen |= _nearest_pairs(positions[known], known, _NEAREST)
     if alike is None or alike.ordered:
@@ -63,7 +69,7 @@ def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None 
     return sorted(chosen)
 
 
-def _most_alike(alike: Similarity, chosen: set[tuple[int, int]], total: int) -> set[tuple[int, int]]:
+def _most_alike(alike: Similarity, chosen: set[Pair], total: int) -> set[Pair]:
     """The pairs most alike of all besides those chosen, so many that there are ``total`` of both."""
     scores = sparse.triu(alike.scores, k=1).tocoo()
     best = np.argsort(-scores.data, kind="stable")
@@ -72,30 +78,28 @@ def _most_alike(alike: Similarity, chosen: set[tuple[int, int]], total: int) -> 
     return set(islice((pair for pair in ranked if pair not in chosen), max(total - len(chosen), 0)))
 
 
-def _nearest_pairs(places: FloatArray, images: IntArray, most: int) -> set[tuple[int, int]]:
+def _nearest_pairs(places: FloatArray, images: IntArray, most: int) -> set[Pair]:
     """Pairs of images of which one is among the nearest of the other, by their places."""
     nearest = nearest_points(places, places, most + 1)[1]
     pairs = np.sort(np.stack([np.repeat(images, nearest.shape[1]), images[nearest.ravel()]], axis=1), axis=1)
     return {(i, j) for i, j in pairs.tolist() if i != j}
 
 
-def select_pairs(
-    shared: Mapping[tuple[int, int], StoredMatches], cameras: Sequence[Camera]
-) -> dict[tuple[int, int], StoredMatches]:
+def select_pairs(shared: Mapping[Pair, StoredMatches], cameras: Sequence[Camera]) -> dict[Pair, StoredMatches]:
     """Of pairs that share something those that one of their images needs for its place.
 
     An image takes one partner after the other: the one whose matches add most to the sum of the square roots of the
     numbers of matches in its cells. So partners with many matches come first, but rather around the image than
     all on one side of it. Of a survey in which each image overlaps twenty others, a third of the pairs is left.
     """
-    partners = defaultdict[int, list[tuple[tuple[int, int], FloatArray]]](list)
+    partners = defaultdict[int, list[tuple[Pair, FloatArray]]](list)
     for pair, matches in shared.items():
         matched = matches.load()
         for image, points in zip(pair, (matched.points1, matched.points2), strict=True):
             cell = np.clip(points / cameras[image].image_size * _CELLS_PER_SIDE, 0, _CELLS_PER_SIDE - 1).astype(np.intp)
             counts = np.bincount(cell @ [1, _CELLS_PER_SIDE], minlength=_CELLS_PER_SIDE**2)
             partners[image].append((pair, counts.astype(np.float64)))
-    chosen: set[tuple[int, int]] = set()
+    chosen: set[Pair] = set()
     for choices in partners.values():
         counts, covered = np.array([cells for _, cells in choices]), np.zeros(_CELLS_PER_SIDE**2)
         for _ in range(min(_PARTNERS, len(choices))):
@@ -105,9 +109,35 @@ def select_pairs(
     return {pair: matches for pair, matches in shared.items() if pair in chosen}
 
 
+def prescreen_pairs(estimator: PairEstimator, pairs: Sequence[Pair]) -> dict[Pair, StoredMatches]:
+    """The pairs whose strongest features match and that matter for the place of an image, with those matches.
+
+    A pair that is passed over may overlap nevertheless, by little: its place then follows from the others.
+    """
+    # These matches are few, of most pairs hardly any: a file for each would take as long as the matching.
+    strongest = replace(estimator, features=estimator.features.strongest(_STRONGEST), store=estimator.cache)
+    shared = dict(zip(pairs, strongest.match(pairs, "comparing images"), strict=True))
+    most = np.zeros(len(estimator.features), dtype=np.intp)
+    for pair, matches in shared.items():
+        most[[*pair]] = np.maximum(most[[*pair]], len(matches))
+    promising = {
+        pair: matches
+        for pair, matches in shared.items()
+        if len(matches) >= max(_MIN_MATCHES, _MIN_RELATIVE_MATCHES * most[[*pair]].min())
+    }
+    return select_pairs(promising, estimator.cameras)
+
+
+def estimate_candidates(estimator: PairEstimator, candidates: Sequence[Pair]) -> list[PairRegistration]:
+    """Estimate the candidate pairs that share something at first sight; all of them where none of those holds."""
+    prescreened = prescreen_pairs(estimator, candidates)
+    pairs = estimator.estimate(prescreened, shared=prescreened)
+    return pairs if any(pair.relation for pair in pairs) else estimator.estimate(candidates)
+
+
 def loop_closures(
-    cameras: Sequence[Camera], homographies: FloatArray, tried: set[tuple[int, int]], *, on_sphere: bool = False
-) -> Pairs:
+    cameras: Sequence[Camera], homographies: FloatArray, tried: set[Pair], *, on_sphere: bool = False
+) -> list[Pair]:
     """Pairs that the poses put over one another and that were not tried yet, where the match graph needs them.
 
     It does not need a pair of images that both have their partners, one of them in common: that closes no loop.

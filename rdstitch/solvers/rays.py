@@ -47,11 +47,10 @@ class RayPairs(SampleArrays):
         first, second = 1.0 + depth * distortion
         return first * second, x * x + y * y
 
-    def tangents_differ(self, distortion: FloatArray, focal2: FloatArray) -> FloatArray:
-        """The difference of both sides of the equation for λ and g² of shape (..., b); shape (P, ..., b)."""
+    def polynomial(self, distortion: FloatArray) -> FloatArray:
+        """The difference of both sides of the equation of the first pair for g = 1, of degree 6 in λ (..., b)."""
         product, length = self.products(distortion)
-        dot = _spread(self.dot, distortion) + focal2 * product
-        cross = _spread(self.cross, distortion) + focal2 * length
+        dot, cross = (_spread(self.dot, distortion) + product)[:, 0], (_spread(self.cross, distortion) + length)[:, 0]
         value: FloatArray = dot[0] * dot[0] * cross[1] - dot[1] * dot[1] * cross[0]
         return value
 

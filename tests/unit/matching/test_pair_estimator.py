@@ -11,10 +11,9 @@ from examples.worlds.correspondences import stored
 from rdstitch.arrays import FloatArray
 from rdstitch.features import Correspondences, Features, match
 from rdstitch.geometry.camera import Camera
-from rdstitch.matching.candidate_pairs import loop_closures
+from rdstitch.matching.candidate_pairs import loop_closures, prescreen_pairs
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.pair_estimator import FeatureMatching, PairEstimator
-from rdstitch.matching.prescreen import prescreen_pairs
 from rdstitch.matching.static_background import (
     has_static_background,
     is_static_pair,
