@@ -40,9 +40,8 @@ def strongest(response: FloatArray, count: int) -> NDArray[np.intp]:
 def spread(points: FloatArray, response: FloatArray, count: int, cell: float) -> NDArray[np.intp]:
     """Indices of ``count`` keypoints at most (N, 2) that are spread over the image, strongest first.
 
-    The cells of a grid, ``cell`` pixels a side, take turns, each giving its strongest keypoint that is left: no cell
-    gets more than another that still has some. The corners, where the distortion is seen, thus keep what they have
-    however strong the middle of the image is.
+    The cells of a grid, ``cell`` pixels a side, take turns, each giving its strongest keypoint that is left: the
+    corners, where the distortion is seen, keep what they have however strong the middle of the image is.
     """
     if len(points) <= count:
         return strongest(response, count)
@@ -63,9 +62,8 @@ ViewLoader = Callable[[float | None], View]
 def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask | None = None) -> Features:
     """Detect and describe the features of one image: the same whatever the number of threads, strongest first.
 
-    The image is grey, grey with alpha, RGB or RGB with alpha; uint8, or uint16 or float, which are stretched to 8 bits.
-    Nothing is detected where alpha is zero, a float is not finite, or the mask is False or zero; a keypoint whose
-    extent reaches into such a place is dropped.
+    The image is grey or RGB, with alpha or without; uint16 and float are stretched to 8 bits. No keypoint reaches into
+    places where alpha is zero, a float is not finite, or the mask is False or zero.
     """
     return detect_view(lambda _: View(image, mask), options or FeatureOptions())
 

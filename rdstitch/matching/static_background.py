@@ -60,8 +60,7 @@ def without_static_background(
 ) -> tuple[PairEstimator, list[PairRegistration]] | None:
     """Where a part of the images is static, the estimator and pairs of what moves; None where none is.
 
-    What the images have in common was static then, so that it says nothing of which of the candidate pairs matter: all
-    of them are compared.
+    All candidate pairs are compared: what the images have in common was static, and did not show which of them matter.
     """
     threshold = estimator.estimation.threshold
     if not has_static_background(pairs, threshold):
