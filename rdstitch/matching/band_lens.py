@@ -18,7 +18,6 @@ from rdstitch.features.patch_shifts import Edges, coarse_shift, edges_of, patch_
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.inputs.source import Source
-from rdstitch.results.messages import Message
 from rdstitch.system.late_imports import optimize
 
 _MAX_IMAGES = 8  # that are compared
@@ -42,18 +41,10 @@ class BandLens:
         """The band's camera beside a registered one."""
         return replace(camera, distortion=camera.distortion + self.distortion)
 
-    @property
-    def message(self) -> Message:
-        """What the user should know of it."""
-        text = (
-            f"{self.shift:.1f} pixels (median) from the registered band, {self.error:.1f} with its lens registered too"
-        )
-        return Message(text, severity="note", code="band-lens")
-
 
 def band_lens(
     pairs: Mapping[int, tuple[Source, Source]], report: Callable[[int, int], None] = lambda done, total: None
-) -> tuple[BandLens | None, list[Message]]:
+) -> BandLens | None:
     """The lens of a band from registered images and those that take their place, by numbers; None where it is the same.
 
     Where the images show nothing in common, as masks do, nothing is known, and nothing changed. Raises InputError where
@@ -63,7 +54,7 @@ def band_lens(
     compared = [list(pairs.values())[k] for k in chosen]
     compared = [pair for pair in compared if pair[0].camera.image_size == pair[1].camera.image_size]
     if not compared:
-        return None, []
+        return None
     edges = []
     for done, pair in enumerate(compared):
         report(done, len(compared))
@@ -77,9 +68,9 @@ def band_lens(
         shifts = [patch_shifts(*each, expected) for each in edges]
         fitted = _fit(camera, shifts)
         if fitted is None:
-            return None, []
+            return None
         found, expected = fitted, partial(_seen_by_band, camera, fitted.homography, fitted.distortion)
-    return (None, []) if found.shift < max(_WORTH_CORRECTING, found.error) else (found, [found.message])
+    return None if found.shift < max(_WORTH_CORRECTING, found.error) else found
 
 
 def _seen_by_band(camera: Camera, homography: FloatArray, distortion: float, points: FloatArray) -> FloatArray:

@@ -17,10 +17,11 @@ from examples.worlds.paths import drive_poses
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.features import FeatureOptions, Features, detect, match
-from rdstitch.features.corner_flow import CornerFlow, corners_of, fitted_affine, matched_corners
+from rdstitch.features.corner_flow import CornerFlow, corners_of, matched_corners
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
+from rdstitch.inputs.keyframes import fitted_affine
 from rdstitch.inputs.odometry import BodyPose
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, blank, sequence_over
