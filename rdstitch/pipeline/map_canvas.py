@@ -23,14 +23,9 @@ def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:
         Crs(options.epsg)
     if options.like is not None:
         read_grid(options.like)
-    placed = has_place([source.metadata.gps for source in sources]) or any(source.control for source in sources)
-    for name, value in (
-        ("gsd", options.gsd),
-        ("crs", options.epsg),
-        ("like", options.like),
-        ("extent", options.extent),
-    ):
-        if value is not None and not placed:
+    wanted = {"gsd": options.gsd, "crs": options.epsg, "like": options.like, "extent": options.extent}
+    for name, value in wanted.items():
+        if value is not None and not has_place(sources):
             raise ArgumentError(
                 f"{name} needs GPS positions of {MIN_POSITIONS} images, in EXIF or a file, or ground control points; "
                 "leave it out"

@@ -97,7 +97,7 @@ class PlacedImages:
     @property
     def has_place(self) -> bool:
         """Whether enough is known for a place of the output on the Earth to be expected."""
-        return has_place(self.positions) or (not self.turned and any(source.control for source in self.sources))
+        return not self.turned and has_place(self.sources)
 
     def located(self, canvas: Canvas) -> Located:
         """The images on a canvas with what is known of where they are."""

@@ -4,10 +4,11 @@ import csv
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -126,6 +127,13 @@ def state_of(folder: Path) -> dict[str, bytes | None]:
         os.fsencode(path.relative_to(folder)).decode("latin-1"): path.read_bytes() if path.is_file() else None
         for path in folder.rglob("*")
     }
+
+
+def copied(files: Iterable[Path], folder: Path, *names: str) -> list[Path]:
+    """Copies under these names, or their own, in a folder that is made where it is missing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    named = zip(files, names, strict=False) if names else ((file, file.name) for file in files)
+    return [Path(shutil.copy(file, folder / name)) for file, name in named]
 
 
 def shown(path: Path) -> str:
