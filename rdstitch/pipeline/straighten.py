@@ -24,8 +24,9 @@ from rdstitch.features.line_segments import MEGAPIXELS, line_segments
 from rdstitch.geometry.planar_motion import nearest_rotation
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.upright_options import UprightOptions
+from rdstitch.pipeline.map_canvas import plan
 from rdstitch.results.messages import Message
-from rdstitch.results.placed_images import PlacedImages, plan
+from rdstitch.results.placed_images import PlacedImages
 
 _MAX_IMAGES = 40
 _MIN_LENGTH = 0.03  # of an edge, half diagonals
