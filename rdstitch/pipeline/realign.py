@@ -34,7 +34,7 @@ def with_reference_of(registration: Registration, aligner: Aligner) -> Registrat
 def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Alignment], bool]) -> Registration | None:
     """The images that are used aligned by another aligner; None where a draft is not wanted."""
     try:
-        draft = aligner.draft(_between_used(registration))
+        draft = aligner.draft(registration.used_pairs)
         if not wanted(draft.alignment):
             return None
         return _aligned_anew(registration, aligner.completed(draft), aligner, {})
@@ -64,19 +64,13 @@ def by_second_motions(registration: Registration, chosen: Iterable[Pair], aligne
         return frozenset(copies.get(k, k) for k in pair)
 
     wanted = {originals(pair) for pair in chosen}
-    used = _between_used(registration)
+    used = registration.used_pairs
     pairs = [pair for pair in used if pair.relation and originals(pair.images) in wanted]
     motions = second_motions(registration.alignment.cameras, pairs, aligner.threshold)
     if not motions:
         return None
     changed = [replace(pair, relation=motions.get(pair.images, pair.relation)) for pair in used]
     return _with_pairs(registration, changed, aligner)
-
-
-def _between_used(registration: Registration) -> list[PairRegistration]:
-    """The pairs of images that are used: what was left out stays out."""
-    used = registration.alignment.used
-    return [pair for pair in registration.pairs if used[pair.image1] and used[pair.image2]]
 
 
 def _with_pairs(registration: Registration, pairs: Sequence[PairRegistration], aligner: Aligner) -> Registration | None:
