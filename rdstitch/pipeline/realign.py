@@ -108,7 +108,7 @@ def left_out_images(rejected: Rejected) -> dict[int, str]:
     return {images[0]: reason for images, reason in rejected.items() if len(images) == 1}
 
 
-def _neighbours_of(rejected: Mapping[int, Message], registration: Registration) -> dict[int, set[int]]:
+def _neighbours_of(rejected: Mapping[int, str], registration: Registration) -> dict[int, set[int]]:
     """The rejected that each other image was linked with."""
     linked: dict[int, set[int]] = {}
     for fit in registration.alignment.links:
