@@ -20,9 +20,8 @@ from rdstitch.pipeline.straighten import oriented
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.registration import Registration
+from rdstitch.verification.limits import Limits
 
-# Of a place over the median one, and of its two directions: those of a plane seen 60 degrees off its normal.
-_MAX_MAGNIFICATION, _MAX_ASPECT = 4.0, 2.0
 # Places (25, 2) all over an image, in shares of its width and height.
 IMAGE_GRID = np.stack(np.meshgrid(*[[0.02, 0.25, 0.5, 0.75, 0.98]] * 2), axis=-1).reshape(-1, 2)
 
@@ -129,4 +128,5 @@ def is_stretched(plan: CanvasPlan) -> bool:
         magnification.append(np.linalg.svd(jacobian, compute_uv=False))
     every = np.concatenate(magnification)
     largest = float(every[:, 0].max() / np.median(every[:, 0]))
-    return largest > _MAX_MAGNIFICATION or float(np.median(every[:, 0] / every[:, 1])) > _MAX_ASPECT
+    aspect = float(np.median(every[:, 0] / every[:, 1]))
+    return largest > Limits.max_magnification.value or aspect > Limits.max_aspect.value
