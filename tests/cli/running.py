@@ -98,7 +98,10 @@ def flight(seed: int, columns: int, rows: int = 1, distortion: float = DISTORTIO
 
 
 def start(
-    *arguments: str | Path, stdin: int = subprocess.DEVNULL, program: str = _PROGRAM
+    *arguments: str | Path,
+    stdin: int = subprocess.DEVNULL,
+    program: str = _PROGRAM,
+    environment: Mapping[str, str] | None = None,
 ) -> "subprocess.Popen[bytes]":
     """Start the command line as a process of its own."""
     return subprocess.Popen(
@@ -106,7 +109,7 @@ def start(
         stdin=stdin,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        env={**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})},
     )
 
 

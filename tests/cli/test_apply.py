@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
 import sys
 import unicodedata
 from pathlib import Path
@@ -19,7 +18,7 @@ from rdstitch.errors import InputError
 from rdstitch.io import read_image
 from rdstitch.io.metadata import read_metadata
 from rdstitch.sidecar.read import read_sidecar
-from tests.cli.running import CACHED, OPTIONS, Outcome, Run, copied, sidecar_of
+from tests.cli.running import CACHED, OPTIONS, Outcome, Run, copied, finished, sidecar_of, start
 
 
 def _sidecar(image: Path) -> Path:
@@ -262,13 +261,6 @@ _LATIN = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONI
 _UTF8 = {"LC_ALL": "C", "PYTHONUTF8": "1"}
 
 
-def _run(locale: dict[str, str], *arguments: str) -> str:
-    command = [sys.executable, "-m", "rdstitch_cli", *arguments]
-    done = subprocess.run(command, capture_output=True, env={**os.environ, **locale}, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stderr.decode("latin-1")
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes")
 @pytest.mark.parametrize(("written", "composed"), [(_LATIN, "NFD"), (_UTF8, "NFC")], ids=["ascii", "utf-8"])
 def test_names_match_whatever_the_locale(
@@ -280,9 +272,11 @@ def test_names_match_whatever_the_locale(
         copied(frames, tmp_path / folder, *(os.fsdecode(unicodedata.normalize(form, name).encode()) for name in names))
     read = _UTF8 if written is _LATIN else _LATIN
     options = ("--max-features", "600", "-j", "1")
-    _run(written, "mosaic", str(tmp_path / "a"), "-o", str(tmp_path / "out.tif"), *options)
-    said = _run(read, "apply", f"{tmp_path}/out.tif.json", "--images", str(tmp_path / "b"), "-o", f"{tmp_path}/new.tif")
-    assert "taken in order" not in said
+    made = start("mosaic", tmp_path / "a", "-o", tmp_path / "out.tif", *options, environment=written)
+    assert finished(made).status == 0
+    images = ("--images", tmp_path / "b", "-o", tmp_path / "new.tif")
+    said = finished(start("apply", tmp_path / "out.tif.json", *images, environment=read))
+    assert (said.status, "taken in order" in said.err) == (0, False)
     saved = sidecar_of(tmp_path / "new.tif")
     assert saved["applied"]["matched"] == "name"
     assert [image["name"] for image in saved["images"]] == names
