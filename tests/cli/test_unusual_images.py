@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,36 +21,29 @@ from tests.cli.faulty import Make
 from tests.cli.running import CACHED, DISTORTION, Run, finished, sidecar_of, start
 
 
-def _saved(good: Path, file: Path, change: Callable[[Image.Image], Image.Image], **options: Any) -> Path:
+def _transparent(image: Image.Image) -> Image.Image:
+    image.putalpha(Image.fromarray(np.where(np.indices((300, 400))[0] < 20, 0, 255).astype(np.uint8)))
+    return image
+
+
+CHANGES: dict[str, tuple[str, Callable[[Image.Image], Image.Image], dict[int, Any]]] = {
+    "cmyk": (".jpg", lambda image: image.convert("CMYK"), {}),
+    "palette": (".png", lambda image: image.quantize(200), {}),
+    "transparent": (".png", _transparent, {}),
+    "grey": (".png", lambda image: image.convert("L"), {}),
+    "turned": (".jpg", lambda image: image.transpose(Image.Transpose.ROTATE_90), {0x0112: 6}),
+    "hostile EXIF": (".jpg", lambda image: image, {0x010F: "\x1b[31m" * 500, 0x8769: {0x920A: (0, 0)}}),
+}
+"""Suffix, change and EXIF of an image that is saved otherwise."""
+
+
+def _changed(kind: str, good: Path, folder: Path) -> Path:
+    suffix, change, tags = CHANGES[kind]
+    exif, file = Image.Exif(), folder / f"odd{suffix}"
+    exif.update(tags)
     with Image.open(good) as image:
-        change(image).save(file, **options)
+        change(image).save(file, **({"exif": exif} if tags else {}))
     return file
-
-
-def _cmyk(good: Path, folder: Path) -> Path:
-    return _saved(good, folder / "odd.jpg", lambda image: image.convert("CMYK"))
-
-
-def _palette(good: Path, folder: Path) -> Path:
-    return _saved(good, folder / "odd.png", lambda image: image.quantize(200))
-
-
-def _transparent(good: Path, folder: Path) -> Path:
-    def change(image: Image.Image) -> Image.Image:
-        image.putalpha(Image.fromarray(np.where(np.indices((300, 400))[0] < 20, 0, 255).astype(np.uint8)))
-        return image
-
-    return _saved(good, folder / "odd.png", change)
-
-
-def _grey(good: Path, folder: Path) -> Path:
-    return _saved(good, folder / "odd.png", lambda image: image.convert("L"))
-
-
-def _turned(good: Path, folder: Path) -> Path:
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    return _saved(good, folder / "odd.jpg", lambda image: image.transpose(Image.Transpose.ROTATE_90), exif=exif)
 
 
 def _with_a_hole(good: Path, folder: Path) -> Path:
@@ -69,15 +63,10 @@ def _sixteen_bit(good: Path, folder: Path) -> Path:
     return folder / "b.png"
 
 
-def _hostile_exif(good: Path, folder: Path) -> Path:
-    exif = Image.Exif()
-    exif[0x010F] = "\x1b[31m" * 500
-    exif[0x8769] = {0x920A: (0, 0)}
-    return _saved(good, folder / "odd.jpg", lambda image: image, exif=exif)
-
-
 @pytest.mark.parametrize(
-    "make", [_cmyk, _palette, _transparent, _grey, _turned, _with_a_hole, _sixteen_bit, _hostile_exif]
+    "make",
+    [*(partial(_changed, kind) for kind in CHANGES), _with_a_hole, _sixteen_bit],
+    ids=[*CHANGES, "hole", "16 bits"],
 )
 def test_unusual_images_are_stitched(rdstitch: Run, place: Path, make: Make) -> None:
     odd = make(place / "b.png", place)
