@@ -42,7 +42,7 @@ def _changed(kind: str, good: Path, folder: Path) -> Path:
     exif, file = Image.Exif(), folder / f"odd{suffix}"
     exif.update(tags)
     with Image.open(good) as image:
-        change(image).save(file, **({"exif": exif} if tags else {}))
+        change(image).save(file, exif=exif if tags else b"")
     return file
 
 
