@@ -92,7 +92,7 @@ class MapRefinement:
         window = self._window
         if window is None or (alignment := self._finished(window, patience)) is None:
             return []
-        waiting = {number for number, frame in keyframe_map.frames.items() if not frame.place.aligned}
+        waiting = {number for number, frame in keyframe_map.frames.items() if not frame.aligned}
         placements, length_factor = _on_map(keyframe_map, window, alignment)
         keyframe_map.align(placements)
         knowledge, frames = keyframe_map.knowledge, [keyframe.frame for keyframe in window.keyframes]
@@ -143,7 +143,7 @@ def _to_map(placed: Sequence[tuple[TrackedFrame, Placement]]) -> tuple[PlaneSimi
     The unit of lengths is the height of the first keyframe: heights stay as they are, whatever focal length they are
     computed by.
     """
-    shared = [(new, keyframe.place.placement) for keyframe, new in placed if keyframe.place.aligned]
+    shared = [(new, keyframe.placement) for keyframe, new in placed if keyframe.aligned]
     if not shared:
         pose = placed[0][1].pose
         return PlaneSimilarity(1.0, 0.0) if pose is None else PlaneSimilarity.to_origin(pose), 1.0
