@@ -63,11 +63,6 @@ class KeyframeMap:
         self.between.append((frame, self.keyframes[-1], before, now))
 
     @property
-    def whole(self) -> bool:
-        """Whether the last keyframes are all of them."""
-        return not self.older
-
-    @property
     def by_number(self) -> dict[int, TrackedFrame]:
         """All keyframes."""
         return {keyframe.number: keyframe for keyframe in (*self.older, *self.keyframes)}
@@ -80,7 +75,7 @@ class KeyframeMap:
     @property
     def keeps_focal(self) -> bool:
         """Whether alignments keep the focal length: that of one map must not depend on the window."""
-        return self.knowledge.focal is not None and (self.knowledge.stated_std > 0.0 or not self.whole)
+        return self.knowledge.focal is not None and (self.knowledge.stated_std > 0.0 or bool(self.older))
 
     def links_with(self, frame: Frame, placed: TrackedFrame | None, match: Matcher) -> list[Link]:
         """Links of a frame with the last keyframes, as far as they can be registered; of a lost one, with more."""

@@ -132,7 +132,8 @@ def _on_map(keyframe_map: KeyframeMap, window: _Window, alignment: Alignment) ->
     placed = [(keyframe, Placement(camera, h, alignment.focal)) for keyframe, camera, h, used in aligned if used]
     move, length_factor = _to_map(placed)
     first, placement = placed[0]
-    if keyframe_map.whole and first.number == keyframe_map.keyframes[0].number and (pose := placement.pose) is not None:
+    is_first = not keyframe_map.older and first.number == keyframe_map.keyframes[0].number
+    if is_first and (pose := placement.pose) is not None:
         move = PlaneSimilarity.to_origin(pose)  # the others are relative to it
     return {keyframe.number: move.applied(placement) for keyframe, placement in placed}, length_factor
 
