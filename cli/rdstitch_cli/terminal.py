@@ -55,11 +55,7 @@ def one_line(text: str) -> str:
 
 
 class Reporter:
-    """Receives what the library has to say while it works.
-
-    It is the ``progress`` callable of the library: called with a stage's name, how much is done and how much there is
-    to do.
-    """
+    """Receives what the library has to say while it works: it is its ``progress`` callable."""
 
     def __init__(self, verbosity: int) -> None:
         self._verbosity = verbosity
@@ -83,18 +79,15 @@ class Reporter:
 
     def warn(self, text: str) -> None:
         """Say what the user should know even though the command succeeds."""
-        if self._verbosity >= 0:
-            self._line(f"rdstitch: warning: {text}")
+        self._line(f"rdstitch: warning: {text}", 0)
 
     def note(self, text: str) -> None:
         """Say what belongs to the result but not to standard output."""
-        if self._verbosity >= 0:
-            self._line(f"rdstitch: {text}")
+        self._line(f"rdstitch: {text}", 0)
 
     def log(self, text: str) -> None:
         """Log what is going on, under ``-v``."""
-        if self._verbosity >= 1:
-            self._line(f"rdstitch: {text}")
+        self._line(f"rdstitch: {text}", 1)
 
     def tell(self, message: "Message") -> None:
         """Say a message as loudly as it is grave."""
@@ -121,8 +114,7 @@ class Reporter:
     def made(self, text: str) -> None:
         """End by saying what was made, and how long it took."""
         self._end_stage()
-        if self._verbosity >= 0:
-            self._line(f"{text}, {time.perf_counter() - self._began:.1f} s")
+        self._line(f"{text}, {time.perf_counter() - self._began:.1f} s", 0)
 
     def __enter__(self) -> Self:
         return self
@@ -131,8 +123,10 @@ class Reporter:
         """Take the bar away, whatever happened."""
         self.finish()
 
-    def _line(self, text: str) -> None:
-        """Print a line; where nobody reads standard error any more, the work goes on without."""
+    def _line(self, text: str, verbosity: int) -> None:
+        """Print a line from a verbosity on; where nobody reads standard error any more, the work goes on without."""
+        if self._verbosity < verbosity:
+            return
         with suppress(OSError):
             if self._bar is not None:
                 self._bar.clear()

@@ -11,17 +11,14 @@ from rdstitch.alignment.least_squares.plane_marks import Sighting
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.measurements import metres_around_median, positions_of
+from rdstitch.inputs.positions import metres_around_median, positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.system.file_access import canonical_name
 
 
 def alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:
-    """What is decided or known beforehand of images as the camera stored them.
-
-    Measured attitudes that are not exact leave the mount's tilt open.
-    """
+    """What is known of images as the camera stored them; attitudes that are not exact leave the mount's tilt open."""
     quarters = QuarterTurns.of(sources)
     measured = [source.attitude for source in sources if source.attitude is not None]
     attitudes = [attitude.tilt for attitude in measured]

@@ -19,10 +19,9 @@ from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.option import declared, with_fields
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.compose import CanvasPlan, compose_images
-from rdstitch.pipeline.deep_zoom_page import plainly_viewed, write_page
 from rdstitch.pipeline.replacements import read_replacements
 from rdstitch.pipeline.run import Run
-from rdstitch.pipeline.run_files import RunFiles, check_world_files
+from rdstitch.pipeline.run_files import RunFiles, check_world_files, plainly_viewed, write_page
 from rdstitch.pipeline.straighten import reoriented
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages, SavedGrid
@@ -121,7 +120,7 @@ def apply_found(
     given = read_replacements(saved, listed.frames, options, run.guard, run.options.composite.max_memory)
     if output is not None:
         check_world_files([output], list(given.sources.values()), options.overwrite)
-    lens, of_lens = _lens_of_band(saved, given.frames, given.sources, run.progress)
+    lens, of_lens = _lens_of_band(saved, given.sources, run.progress)
     plan, run, of_turn = _laid_out(saved, given.sources, lens, run)
     composed, of_output = compose_images(plan, run, outputs)
     sources = dict(zip(given.sources, plan.placed.sources, strict=True))
@@ -137,11 +136,7 @@ def apply_found(
         return result
     page = partial(plainly_viewed, result.canvas, [source.name for source in sources.values()])
     result = replace(result, messages=(*result.messages, *write_page(result, outputs, page)))
-    homographies = list(plan.placed.homographies)
-    record = applied_sidecar(
-        saved, result, sources, homographies, given.left_out, given.matched, same_lens=lens is None
-    )
-    outputs.write(f"{output}.json", json_bytes(record))
+    outputs.write(f"{output}.json", json_bytes(applied_sidecar(result, same_lens=lens is None)))
     return result
 
 
@@ -181,11 +176,12 @@ def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: Co
 
 
 def _lens_of_band(
-    saved: SavedRegistration, frames: Mapping[int, Frame], used: Mapping[int, Source], progress: Progress
+    saved: SavedRegistration, used: Mapping[int, Source], progress: Progress
 ) -> tuple[BandLens | None, list[Message]]:
     """The lens that took the given images, where that is another one than took those that were registered."""
     if saved.record.stage is not None:
         return None, []  # channels of a microscope have their places in common, not their content
+    frames = {index: source.frame or Frame(source.path) for index, source in used.items()}
     files = files_of(frame for frame in frames.values() if frame.number is None)
     originals = {k: file for k in frames if (file := saved.original(saved.images[k])) is not None}
     if files and not originals:

@@ -63,7 +63,7 @@ class CanvasPlan:
         canvas, place, reason = plan_on_map(placed, options)
         if options.rectangle is not None:
             canvas = replace(canvas, cropped_to=_box_of_rectangle(placed, options.rectangle, canvas))
-        return cls(placed, canvas, placed.images(canvas.near), place, reason)
+        return cls(placed, canvas, placed.images(canvas), place, reason)
 
     def decided(self, options: CompositeOptions) -> Self:
         """The plan with exposure, seams and crop of its images, decided on small versions of them."""
@@ -78,11 +78,10 @@ class CanvasPlan:
 def compose_images(
     plan: CanvasPlan, run: Run, outputs: Outputs, run_blocks: BlockRunner | None = None
 ) -> tuple[OutputImage, list[Message]]:
-    """See whether a file can hold the canvas, and put the images on it; of a dry run the plan alone.
+    """Put images on a canvas, in memory or into a file that can hold it, of a dry run plan it; and what to know of it.
 
-    Without an output the image is made in memory; a file has colour profile and EXIF of the first image, and its place
-    on the Earth. ``run_blocks``: see :func:`rdstitch.compositing.compose_decided`. With it comes what the user should
-    know, such as why nothing was cropped.
+    A file has colour profile and EXIF of the first image, and its place on the Earth. ``run_blocks``: see
+    :func:`rdstitch.compositing.compose_decided`.
     """
     return_freed_memory()
     options = run.options.compositing

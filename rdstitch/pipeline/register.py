@@ -8,23 +8,20 @@ from functools import partial
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.unaligned import explain_unaligned
-from rdstitch.choices import Purpose
 from rdstitch.features import LightGlue, match
-from rdstitch.inputs.measurements import positions_of
+from rdstitch.inputs.positions import positions_of
 from rdstitch.inputs.source import Source
-from rdstitch.matching.candidate_pairs import first_pairs
+from rdstitch.matching.candidate_pairs import estimate_candidates, first_pairs
 from rdstitch.matching.mixed_lenses import separate_lenses
 from rdstitch.matching.pair_estimator import FeatureMatching, PairEstimator
-from rdstitch.matching.prescreen import estimate_candidates
 from rdstitch.matching.repeated_pattern import match_repeated_patterns
 from rdstitch.matching.static_background import without_static_background
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, draft_with_loops, impossible_estimates_fail
 from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.image_circle import with_image_circle
-from rdstitch.pipeline.match_crossings import match_crossings
+from rdstitch.pipeline.repeated_patterns import match_crossings, settle_repeated_pattern
 from rdstitch.pipeline.run import Run
-from rdstitch.pipeline.settle_repeated_pattern import settle_repeated_pattern
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.results.registration import Registration
@@ -40,11 +37,10 @@ _STATIC_BACKGROUND = Message(
 
 @impossible_estimates_fail()
 def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registration:
-    """Detect features, register pairs, and align all images as one.
+    """Detect features, register pairs, and align all images, of two lenses those of one, in pixels of the working size.
 
     Once there are poses, images that these put beside each other are tried too (loop closures), and every pair of an
-    image that found no place. Where the images come from two lenses, those of one are aligned. All pixels in the
-    result are those of the size that features are detected at, see :mod:`rdstitch.pipeline.working_size`.
+    image that found no place.
     """
     options, purpose, progress = run.options.for_images(len(sources)), run.purpose, run.progress
     cache = Cache.at(options.cache)
@@ -52,10 +48,7 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
         sources = with_image_circle(sources, executor, cache, run.guard, options.features.limits[1])
     aligner = Aligner.of(sources, options, cache, purpose)
     store = cache if options.cache is not None else Cache.for_this_run()
-    skip_bad = purpose is not Purpose.PANO
-    detected = detect_by_contrast(
-        sources, options.features, executor, store, run.guard, skip_bad=skip_bad, progress=progress
-    )
+    detected = detect_by_contrast(sources, options.features, run, executor, store)
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
     candidates = first_pairs(features, options.seed, positions_of(sources))
@@ -100,8 +93,8 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
 def with_frontal_reference(registration: Registration, options: StitchOptions, *, always: bool) -> Registration:
     """The same registration with an undistorted image as its plane; directions of a turn on the spot stay.
 
-    That is the reference image, unless another one crosses its horizon and nobody named it: then one that, if possible,
-    no image crosses the horizon of. With ``always`` a rectified plane, that of one camera's poses, gives way too.
+    That is the reference image, unless it was chosen here and another one crosses its horizon. With ``always`` a
+    rectified plane, that of one camera's poses, gives way too.
     """
     alignment = registration.alignment
     if alignment.on_sphere or (not always and alignment.poses is not None):

@@ -1,6 +1,5 @@
 """What registering a set of images gives."""
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
@@ -99,6 +98,12 @@ class Registration:
         return [source.name for source, used in zip(self.sources, self.alignment.used, strict=True) if used]
 
     @property
+    def used_pairs(self) -> list[PairRegistration]:
+        """Every pair of images that are in the result."""
+        used = self.alignment.used
+        return [pair for pair in self.pairs if used[pair.image1] and used[pair.image2]]
+
+    @property
     def summary(self) -> str:
         """How many images are in the result, and λ with its standard deviation, in one line."""
         used = int(self.alignment.used.sum())
@@ -107,12 +112,15 @@ class Registration:
             linked = int(self.tiles.linked.sum())
             alone = f", {used - linked} by the stage alone" if linked < used else ""
             images = f"{linked} of {used + len(self.left_out)} images registered{alone}"
-        distortion, deviation = self.alignment.distortion, self.alignment.distortion_std
-        if not math.isfinite(deviation):
-            return f"{images}, λ not observable"
-        return f"{images}, λ = {distortion:.4f} " + (
-            f"({self.alignment.lens_reason})" if deviation == 0.0 else f"± {deviation:.4f}"
-        )
+        return f"{images}, λ {'= ' if self.alignment.lens_observable else ''}{self.distortion_in_words(4)}"
+
+    def distortion_in_words(self, digits: int) -> str:
+        """λ, to so many digits, with its standard deviation or why it has none."""
+        alignment = self.alignment
+        if not alignment.lens_observable:
+            return "not observable"
+        error = f"({alignment.lens_reason})" if alignment.lens_given else f"± {alignment.distortion_std:.{digits}f}"
+        return f"{alignment.distortion:.{digits}f} {error}"
 
     @property
     def upright_camera(self) -> Camera:

@@ -11,7 +11,7 @@ from rdstitch.geometry.division_model import OBSERVABLE_STD
 from rdstitch.robust.loss import loss_width
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
-from rdstitch.robust.posterior import LENS, Evidence, farthest_error, freedom_cost
+from rdstitch.robust.posterior import LENS, Evidence, farthest_error
 from rdstitch.robust.refinement import Fits, PairEquations, PairProblems, refine_pairs
 
 _STEPS = 20  # of refinement; halved or doubled, the median error of λ changes by a sixth at most
@@ -133,9 +133,9 @@ def select_models(planar: Sequence[PlanarPairModel], pairs: PairSelection) -> li
 def _score(fitted: _Fitted, evidence: Evidence, row: IntArray, column: IntArray, fixed_distortion: bool) -> FloatArray:
     """-2 log of the posterior of a model of each pair (B,), by the matches at these places, up to a constant."""
     equations, distortion = fitted.equations, fitted.fits.distortion
-    seen = evidence.cost(equations.transferred.whitened(row, column))
+    seen = evidence.cost(equations.transferred.whitened(row, column), equations.information.shape[1])
     lens = np.zeros(len(distortion)) if fixed_distortion else np.array([LENS[0].cost(x) for x in distortion.tolist()])
-    return seen.cost + freedom_cost(equations.information.shape[1], seen.count) + equations.prior + lens
+    return seen.cost + equations.prior + lens
 
 
 def _finished(fitted: _Fitted, pairs: PairSelection, reasons: list[str]) -> list[PairFit]:

@@ -5,13 +5,13 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from rdstitch.choices import TrajectoryFormat, TrajectoryFrame
+from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
 from rdstitch.options.feature_options import FeatureOptions
 from rdstitch.options.option import Option
 from rdstitch.options.shared_options import Every, Height
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch_cli.flags import Inputs, command, flags_of
-from rdstitch_cli.following import FOLLOWING, followed, print_result
+from rdstitch_cli.following import Following, Idle, followed, print_result
 from rdstitch_cli.stitching import report_registration, resolve, stitch_options
 from rdstitch_cli.terminal import Reporter
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 """,
     flags_of(StitchOptions, without="reference gcp check_points local_alignment dry_run save_camera camera_format"),
     flags_of(FeatureOptions),
-    FOLLOWING,
 )
 def trajectory(
     inputs: Inputs,
@@ -53,8 +52,8 @@ def trajectory(
     height: Height = None,
     plot: Annotated[Path | None, Option("Draw the path to FILE (SVG).", "FILE", writes=True)] = None,
     every: Every = 1,
-    following: bool,
-    idle: float | None,
+    following: Following = False,
+    idle: Idle = None,
     reporter: Reporter,
     **given: Any,
 ) -> None:
@@ -65,7 +64,6 @@ def trajectory(
     poses are printed as frames arrive.
     """
     from rdstitch.export.trajectory_files import frame_of
-    from rdstitch.pipeline.along_odometry import with_odometry_of_bag
     from rdstitch.pipeline.recipes import trajectory as recipe
     from rdstitch.pipeline.run import Run
     from rdstitch.pipeline.run_files import RunFiles
@@ -75,7 +73,7 @@ def trajectory(
     with ExitStack() as stack:
         paths: Sequence[Named]
         if following:
-            run = Run.of(inputs, with_odometry_of_bag(inputs, options))
+            run = Run.of(inputs, options, purpose=Purpose.TRAJECTORY)
             files, options = RunFiles.of_path(run, inputs, output, plot, file_format), run.options
             poses = FollowedPoses(height, frame or frame_of(file_format))
             paths = stack.enter_context(followed(inputs, run, files, reporter, every=every, idle=idle, poses=poses))
