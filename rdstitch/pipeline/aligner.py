@@ -119,7 +119,7 @@ class Aligner:
         ground = over_rough_ground(pairs, self.threshold)
         if ground is not pairs and not self._explains(aligned.alignment, pairs, ground):
             over = self._drafted(ground)
-            if over.alignment.rms <= Limits.max_rough_rms.value * self.threshold:  # else it is not one ground
+            if over.alignment.rms <= Limits.max_rough_rms * self.threshold:  # else it is not one ground
                 aligned = replace(over, pairs=tuple(pairs), rough=True)
         return self.metric(aligned) if self.needs_poses else aligned
 
