@@ -106,7 +106,7 @@ class Aligner:
         tilts = self.options.exact_tilts(len(self.cameras))
         if not tilts:
             return tilts
-        return [(psi, theta) for psi, theta in self._quarters.upright_tilts(np.array(tilts)).tolist()]
+        return [(psi, theta) for psi, theta in self._quarters.tilts(np.array(tilts)).tolist()]
 
     def align(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
         """Align the images by the pairs that were registered; from an earlier run where the cache has it."""
@@ -156,10 +156,10 @@ class Aligner:
         if not related:  # all images show the same
             copies = {}
             related = distinct(pairs, copies)
-        most, quarters = most_matches_read(len(related), self.options), self._quarters
-        cameras = tuple(quarters.stored_camera(camera, k) for k, camera in enumerate(self.cameras))
+        most, stored = most_matches_read(len(related), self.options), self._quarters.back
+        cameras = tuple(stored.camera(camera, k) for k, camera in enumerate(self.cameras))
         named = (replace(pair.link().thinned(most), image1=i, image2=j) for (i, j), pair in related.items())
-        links = tuple(quarters.stored_link(link, self.cameras) for link in named)
+        links = tuple(stored.link(link, self.cameras) for link in named)
         if (size := common_size(cameras, links)) is not None:
             cameras = tuple(framed_camera(camera, size) for camera in cameras)
             links = tuple(framed_link(link, size) for link in links)
@@ -188,10 +188,10 @@ class Aligner:
         given = task.given
         inputs = (given.cameras, self.cache.digest(given.links), given.options)
         alignment = self.cache.recall(stage, inputs, compute)
-        sizes = [self._quarters.stored_camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
+        sizes = [self._quarters.back.camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
         if any(camera.image_size != size for camera, size in zip(alignment.cameras, sizes, strict=True)):
             alignment = cut_alignment(alignment, sizes)
-        return self._quarters.upright_alignment(alignment, given.options.gravity)
+        return self._quarters.alignment(alignment, given.options.gravity)
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
         """A draft of the same pairs by a model with metric poses, where the user left the choice of the model open."""
