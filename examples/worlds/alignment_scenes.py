@@ -1,6 +1,7 @@
 """Links synthesised from known poses, for the tests of the global adjustment."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -100,6 +101,22 @@ def scene(
         p2[wrong] += rng.uniform(-4, 4, (int(wrong.sum()), 2))
         links.append(Link(i, j, p1, p2, _relation(h, lens, distortion, len(p1), rng)))
     return Scene(cameras, links, truth, poses, distortion)
+
+
+def grid_scene(
+    columns: int,
+    rows: int,
+    step: tuple[float, float] = (0.4, 0.3),
+    yaw: float = 0.2,
+    *,
+    wind: tuple[float, float] = (0.0, 0.0),
+    seed: int,
+    **options: Any,
+) -> Scene:
+    """A :func:`scene` over a :func:`grid`, by ``wind`` :func:`jittered`, by one generator of random numbers."""
+    rng = np.random.default_rng(seed)
+    poses = grid(columns, rows, step, yaw, rng)
+    return scene(jittered(poses, *wind, rng) if any(wind) else poses, rng=rng, **options)
 
 
 def _seen(inverse: FloatArray, lens: Camera, pixels: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, GivenImages, most_matches_read
+from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
 from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.choices import Purpose
@@ -165,7 +165,7 @@ class Aligner:
             links = tuple(framed_link(link, size) for link in links)
         reference = self.options.reference
         options = replace(self.options, reference=None if reference is None else copies.get(reference, reference))
-        task = AlignmentTask(GivenImages(cameras, links, options))
+        task = AlignmentTask(cameras, links, options)
         ends = [pair.images for pair in related.values()]
 
         def complete(stage: str, compute: Callable[[], Alignment]) -> Alignment:
@@ -185,13 +185,12 @@ class Aligner:
 
     def _recalled(self, stage: str, task: AlignmentTask, compute: Callable[[], Alignment]) -> Alignment:
         """An alignment of the upright images; from an earlier run where the cache has it."""
-        given = task.given
-        inputs = (given.cameras, self.cache.digest(given.links), given.options)
+        inputs = (task.cameras, self.cache.digest(task.links), task.options)
         alignment = self.cache.recall(stage, inputs, compute)
         sizes = [self._quarters.back.camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
         if any(camera.image_size != size for camera, size in zip(alignment.cameras, sizes, strict=True)):
             alignment = cut_alignment(alignment, sizes)
-        return self._quarters.alignment(alignment, given.options.gravity)
+        return self._quarters.alignment(alignment, task.options.gravity)
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
         """A draft of the same pairs by a model with metric poses, where the user left the choice of the model open."""

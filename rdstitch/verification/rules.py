@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from rdstitch.alignment.result import LinkFit, links_by_image
-from rdstitch.alignment.unaligned import few_features
+from rdstitch.alignment.sentences import few_features
 from rdstitch.choices import Purpose
 from rdstitch.inputs.source import Source
 from rdstitch.results.messages import Severity

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rdstitch.alignment.adjusted_images import GivenImages
+from rdstitch.alignment.alignment_options import GivenImages
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import CameraPriors
