@@ -67,17 +67,20 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
         attitudes = at_delay(np.asarray(options.delayed_attitudes), late[0])
         return replace(options, attitudes=attitudes, delayed_attitudes=None), attitudes_late(*late)
     given, stated = known.attitudes + known.tilt, options.attitudes_std if options.attitudes is not None else 0.0
-    found = shown.compared(given)
-    if found.as_given - shown.log_likelihood(given, stated) < _LOG_ODDS or found.scatter <= stated:
+    # The largest log likelihood and its scatter of tilts as given, with other signs or order, and of none.
+    changed = [shown.best_scatter(given @ change.T) for change in _SIGNED_ORDERS]
+    (as_given, scatter), likeliest = changed[0], max(range(len(changed)), key=lambda k: changed[k][0])
+    (as_changed, scatter_changed), (without_any, _) = changed[likeliest], shown.best_scatter(np.zeros_like(given))
+    if as_given - shown.log_likelihood(given, stated) < _LOG_ODDS or scatter <= stated:
         return None
-    if max(found.changed, found.without) >= found.as_given + _LOG_ODDS:
+    if max(as_changed, without_any) >= as_given + _LOG_ODDS:
         if options.attitudes is None:
             return without, tilt_contradicted(given[0], np.median(shown.tilts, axis=0))
-        change = found.change if found.changed > found.without + _LOG_ODDS else None
-        return without, attitudes_contradicted(found.scatter, change, max(found.scatter_changed, _EXACT))
+        change = _SIGNED_ORDERS[likeliest] if as_changed > without_any + _LOG_ODDS else None
+        return without, attitudes_contradicted(scatter, change, max(scatter_changed, _EXACT))
     if options.attitudes is None:
         return None
-    return replace(options, attitudes_std=found.scatter), attitudes_scatter(found.scatter, stated)
+    return replace(options, attitudes_std=scatter), attitudes_scatter(scatter, stated)
 
 
 def _fit_without_tilts(
@@ -137,18 +140,6 @@ def judged_focal(stated_std: float, shown: float, shown_std: float) -> tuple[flo
 
 
 @dataclass(frozen=True, eq=False)
-class _Comparison:
-    """Log likelihoods, each at its best scatter, of tilts as given, with other signs or order, and of none."""
-
-    as_given: float
-    scatter: float  # radians
-    change: FloatArray  # (2, 2): the likeliest of the changes
-    changed: float
-    scatter_changed: float
-    without: float
-
-
-@dataclass(frozen=True, eq=False)
 class _ShownTilts:
     """What the images show of their tilts."""
 
@@ -185,13 +176,6 @@ class _ShownTilts:
         error = self.axes.T @ (self.tilts - expected[self.images]).ravel()
         variance = self.variances + scatter**2 + _EXACT**2
         return -0.5 * float((error**2 / variance + np.log(variance)).sum())
-
-    def compared(self, given: FloatArray) -> _Comparison:
-        """Tilts (N, 2) that are given, with what they might be instead."""
-        changed = [self.best_scatter(given @ change.T) for change in _SIGNED_ORDERS]
-        best = max(range(len(changed)), key=lambda k: changed[k][0])
-        without, _ = self.best_scatter(np.zeros_like(given))
-        return _Comparison(*changed[0], _SIGNED_ORDERS[best], *changed[best], without)
 
     def best_scatter(self, expected: FloatArray) -> tuple[float, float]:
         """The largest log likelihood of tilts (N, 2), and the scatter that it has."""

@@ -19,7 +19,7 @@ from rdstitch.alignment.noise import Coherence, coherence, evidence_of
 from rdstitch.alignment.pairwise import pairwise_homographies
 from rdstitch.arrays import BoolArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, LENS_STD
-from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, costs
+from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, Prior, of_each
 
 LENSES: dict[str, tuple[str, ...]] = {
     "division": ("distortion",),
@@ -159,7 +159,7 @@ def _score(evidence: Evidence, observations: Observations, fit: BundleAdjustment
     shared = 2.0 * len(observations.points1) / float(seen.count[0])
     relative = fit.covariance * shared / np.outer(LENS_STD[free], LENS_STD[free])
     narrowed = -np.log(np.clip(np.linalg.eigvalsh(relative), 1e-300, 1.0)).sum()
-    return float(seen.cost[0]) + costs(LENS, lens) + float(narrowed)
+    return float(seen.cost[0] + of_each(Prior.cost, LENS, lens).sum() + narrowed)
 
 
 def _reason(names: Sequence[str], fits: Sequence[BundleAdjustmentResult], best: int) -> str:
