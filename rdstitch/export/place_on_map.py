@@ -8,8 +8,7 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.export.camera_views import Views, as_complex, views_of
-from rdstitch.export.georeference import CONTROL, GPS, Georeference, PositionKind, Residual
-from rdstitch.export.georeference_text import metres
+from rdstitch.export.georeference import CONTROL, GPS, Georeference, PositionKind, Residual, metres
 from rdstitch.export.map_fit import MapFit, Measured, fit_map
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import WGS84, Crs, middle

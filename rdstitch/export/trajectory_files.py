@@ -137,9 +137,8 @@ def as_csv(path: Trajectory, frame: TrajectoryFrame) -> str:
 
 def as_tum(path: Trajectory, frame: TrajectoryFrame) -> str:
     """Lines ``timestamp tx ty tz qx qy qz qw``; where not every frame has a time, numbers of frames stand for them."""
-    times = path.timestamp if path.timestamp is not None and has_times(path) else path.frame
     half = heading(path, frame) / 2
-    rows = zip(times, positions_in_frame(path, frame), np.sin(half), np.cos(half), strict=True)
+    rows = zip(times_or_numbers(path), positions_in_frame(path, frame), np.sin(half), np.cos(half), strict=True)
     lines = [f"{time:.6f} {x:.9g} {y:.9g} {z:.9g} 0 0 {qz:.9g} {qw:.9g}" for time, (x, y, z), qz, qw in rows]
     return "\n".join(lines) + "\n"
 
@@ -167,6 +166,11 @@ def positions_in_frame(path: Trajectory, frame: TrajectoryFrame) -> FloatArray:
 def has_times(path: Trajectory) -> bool:
     """Check whether every frame has a time stamp."""
     return path.timestamp is not None and bool(np.isfinite(path.timestamp).all())
+
+
+def times_or_numbers(path: Trajectory) -> FloatArray:
+    """Time stamps (F,), or numbers of frames where not every one has a time."""
+    return np.asarray(path.timestamp if has_times(path) else path.frame)
 
 
 WRITERS: dict[str, Callable[[Trajectory, TrajectoryFrame], str]] = {"csv": as_csv, "tum": as_tum, "kitti": as_kitti}

@@ -5,9 +5,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 from typing import IO
 
@@ -17,7 +15,7 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.frame import Frame, Named, array_as_image
 from rdstitch.inputs.growing_folder import GrowingFolder
 from rdstitch.inputs.rosbag import images_in_bag, is_bag
-from rdstitch.io.video import VIDEO_SUFFIXES, opened_capture, write_frame
+from rdstitch.io.video import VIDEO_SUFFIXES, grabbed_frames, opened_capture, write_frame
 
 _POLL_SECONDS = 0.2
 _REOPEN_SECONDS = 5.0  # without a frame, after which a camera or stream is opened again
@@ -105,15 +103,11 @@ def _read_lines(stream: IO[str], read: "queue.Queue[str | None]") -> None:
 
 def _of_video(video: Path, every: int) -> Iterator[Frame]:
     """Every n-th frame of a video with its number and time."""
-    with _capture(str(video)) as capture:
-        for number in count():
-            if not capture.grab():
-                return
-            stamp = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
-            decoded, pixels = capture.retrieve() if number % every == 0 else (False, None)
-            if decoded and pixels is not None:
-                name = f"{video.stem}_{number:06d}.png"
-                yield Frame(Path(name), number, stamp, array_as_image(name, pixels, "bgr"))
+    for number, stamp, capture in grabbed_frames(video):
+        decoded, pixels = capture.retrieve() if number % every == 0 else (False, None)
+        if decoded and pixels is not None:
+            name = f"{video.stem}_{number:06d}.png"
+            yield Frame(Path(name), number, stamp, array_as_image(name, pixels, "bgr"))
 
 
 def _of_stream(
@@ -121,7 +115,9 @@ def _of_stream(
 ) -> Iterator[Frame]:
     """Every n-th frame of a camera or stream; kept as files too, since they come only once."""
     source = int(stream) if stream.isdecimal() else stream
-    with _capture(source) as capture:
+    with opened_capture(source) as capture:
+        if not capture.isOpened():
+            raise InputError(f"{source}: OpenCV cannot open this camera, video or stream")
         number, last = 0, time.monotonic()
         opened, has_end = last, capture.get(cv2.CAP_PROP_FRAME_COUNT) > 0  # a video behind a URL
         while True:
@@ -141,11 +137,3 @@ def _of_stream(
                 kept.append(Frame(write_frame(folder() / name, pixels), number, stamp))
                 yield Frame(Path(name), number, stamp, array_as_image(name, pixels, "bgr"))
             number += 1
-
-
-@contextmanager
-def _capture(source: int | str) -> Iterator[cv2.VideoCapture]:
-    with opened_capture(source) as capture:
-        if not capture.isOpened():
-            raise InputError(f"{source}: OpenCV cannot open this camera, video or stream")
-        yield capture

@@ -1,4 +1,4 @@
-"""Where images were taken, by a table, exiftool or a track, instead of by EXIF.
+"""Where images were taken: in metres by their GPS, which a table, exiftool or a track may say instead of EXIF.
 
 ================================= ====================================================================
 CSV with a header                 a name, and latitude and longitude, or x and y; as ``exiftool -csv`` too
@@ -20,7 +20,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.geometry.crs import WGS84
+from rdstitch.geometry.crs import WGS84, Crs
 from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.inputs.rows_of_images import RowsByImage
@@ -49,6 +49,24 @@ _LISTED = ("name", "x", "y", "altitude", "yaw", "pitch", "roll", "north_std", "u
 _WANTED = ("name,latitude,longitude", "name,x,y")
 UNITS = ("deg", "degrees", "m", "metres", "meters")
 _RECORDS = "a list of objects with SourceFile, GPSLatitude and GPSLongitude"
+
+
+def positions_of(sources: Sequence[Source]) -> FloatArray:
+    """Metres east and north (N, 2) of the median of the images' GPS positions; NaN where unknown."""
+    return metres_around_median([source.metadata.gps for source in sources])
+
+
+def metres_around_median(known: Sequence[GpsPosition | None]) -> FloatArray:
+    """Metres east and north (N, 2) of the median of positions, on a conformal map; NaN where unknown."""
+    degrees = [(np.nan, np.nan) if gps is None else (gps.latitude, gps.longitude) for gps in known]
+    latitude, longitude = np.array(degrees, dtype=np.float64).reshape(-1, 2).T
+    if not (places := np.isfinite(latitude)).any():
+        return np.full((len(known), 2), np.nan)
+    metres = np.full((len(known), 2), np.nan)
+    metres[places] = Crs.nearest(latitude[places], longitude[places]).project(latitude[places], longitude[places])
+    metres[~np.isfinite(metres).all(axis=1)] = np.nan
+    around: FloatArray = metres - np.nanmedian(metres, axis=0)
+    return around
 
 
 def with_positions(

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from rdstitch.errors import InputError
 from rdstitch.io.opening import check_readable, decoding
+from rdstitch.io.read_tiff import image_pages
 from rdstitch.io.reduction import block_mean
-from rdstitch.io.tiff_pages import image_pages
 from rdstitch.system.late_imports import tifffile
 
 

@@ -36,8 +36,7 @@ from rdstitch.io.opening import (
 )
 from rdstitch.io.radiometric_tags import Radiometry, read_radiometry
 from rdstitch.io.raw import own_exif, raw_exif, raw_size
-from rdstitch.io.read_tiff import channel_count
-from rdstitch.io.tiff_pages import first_image_pages
+from rdstitch.io.read_tiff import channel_count, first_image_pages
 from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile
 

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from rdstitch.io.pyramid import pyramid, pyramid_sizes
 from rdstitch.io.strips import STRIP_ROWS, ImageSpec, Strip, placed_rows, zero_uncovered
-from rdstitch.io.tiff import MIN_OVERVIEW, ExtraTag, copied_tags
-from rdstitch.io.tiff_tiles import TILE, encoded_tile, has_predictor, tiles_of
+from rdstitch.io.tiff import MIN_OVERVIEW, TILE, ExtraTag, copied_tags, encoded_tile, has_predictor, tiles_of
 from rdstitch.system.late_imports import tifffile
 
 OME_SUFFIXES = (".ome.tif", ".ome.tiff")

@@ -16,10 +16,9 @@ from rdstitch.io.metadata import GREY_16, Metadata, is_grey, is_transparent, met
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image
 from rdstitch.io.raw import read_raw
 from rdstitch.io.read_jpeg import decoded_jpeg, most_bytes
-from rdstitch.io.read_tiff import as_opacity, read_page
+from rdstitch.io.read_tiff import as_opacity, first_image_pages, read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME, as_alpha
-from rdstitch.io.tiff_pages import first_image_pages
 from rdstitch.system.file_access import open_regular, read_beginning
 from rdstitch.system.late_imports import imagecodecs, tifffile
 

@@ -1,10 +1,12 @@
-"""The samples of a TIFF page, whatever its compression: what a band is follows from the page's tags alone.
+"""Which pages of a TIFF file are its images, and their samples, whatever their compression: by the tags alone.
 
 The photometric interpretation says how many bands are colour, ExtraSamples which of the others is alpha; all others are
 data. An internal mask (a page of its own, as GDAL writes it), GDAL's NODATA and alpha say together where there is
 something.
 """
 
+from collections.abc import Iterator
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.io.colour import srgb_of_lab, without_inks
+from rdstitch.io.ome import OmeImage, read_ome
 from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME, as_alpha
 from rdstitch.system.late_imports import tifffile
 
@@ -30,6 +33,25 @@ _INDIRECT = (_PALETTE, _INKS)  # become 8-bit RGB, beside which their other band
 _ASSOCIATED, _UNASSOCIATED = 1, 2  # alpha; colours of the first are multiplied by it
 _JPEG = (6, 7, 33007, 34892)  # compressions whose decoders make RGB of YCbCr
 _PROFILE, _NODATA = 34675, 42113
+
+
+def image_pages(tiff: "tifffile.TiffFile") -> Iterator["tifffile.TiffPage"]:
+    """The pages of a file that are images of their own; the first page always is."""
+    yield tiff.pages.first
+    for number in range(1, len(tiff.pages)):  # which goes through the whole file
+        page = tiff.pages[number]
+        page = page if isinstance(page, tifffile.TiffPage) else page.aspage()
+        if not (page.is_reduced or page.is_mask):
+            yield page
+
+
+def first_image_pages(tiff: "tifffile.TiffFile", ome: OmeImage | None = None) -> list["tifffile.TiffPage"]:
+    """The pages of the first image: one, or those of all channels where an OME-TIFF has these on pages of their own."""
+    ome = ome or read_ome(tiff.ome_metadata)
+    count = 1 if ome is None else max(1, ome.channels)
+    pages = list(islice(image_pages(tiff), count))
+    alike = len({(page.shape, page.dtype) for page in pages}) == 1 and pages[0].axes == "YX"
+    return pages if len(pages) == count and alike else pages[:1]
 
 
 def channel_count(page: "tifffile.TiffPage") -> int:

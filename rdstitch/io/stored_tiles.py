@@ -21,8 +21,7 @@ from rdstitch.choices import ZPlane
 from rdstitch.errors import InputError
 from rdstitch.io.ome import MICROMETRES, Page, ome_pixel_size, ome_planes, ome_tree
 from rdstitch.io.opening import TIFF_MAGIC, decoding
-from rdstitch.io.read_tiff import read_page
-from rdstitch.io.tiff_pages import image_pages
+from rdstitch.io.read_tiff import image_pages, read_page
 from rdstitch.system.file_access import canonical_name, canonical_text, open_regular
 from rdstitch.system.late_imports import tifffile
 

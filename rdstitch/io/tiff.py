@@ -20,10 +20,12 @@ from rdstitch.io.pyramid import pyramid, pyramid_sizes
 from rdstitch.io.samples import as_alpha
 from rdstitch.io.strips import ImageSpec, Strip, with_alpha
 from rdstitch.io.tiff_order import put_in_order
-from rdstitch.io.tiff_tiles import BUFFER, TILE, deflated, encoded_tile, has_predictor, tiles_of
 from rdstitch.results.messages import Message
-from rdstitch.system.late_imports import tifffile
+from rdstitch.system.late_imports import imagecodecs, tifffile
 
+TILE = 256  # side, pixels
+_BUFFER = 2**24  # bytes of tiles that tifffile holds before it writes them; 256 MB by default
+_DEFLATE_LEVEL = 1  # of 1 to 12: 2 takes 1.7 times as long and makes files 2 % smaller
 MIN_OVERVIEW = 256  # pixels along the longer side: smaller images need no overview
 _REDUCED, _MASK = 1, 4  # kinds of pages (NewSubfileType)
 _BIGTIFF_FROM = 2**32 - 2**27
@@ -117,7 +119,7 @@ def _write_page(
         tile=(TILE, TILE),
         compression="zlib",
         predictor=has_predictor(spec.dtype),
-        buffersize=BUFFER,
+        buffersize=_BUFFER,
         metadata=None,
         software="rdstitch",
         subfiletype=kind,
@@ -132,7 +134,7 @@ def _without_alpha(strips: Iterable[NDArray[Any]], mask: list[bytes]) -> Iterato
     """The strips without alpha; tiles of where that is not 0, one bit a pixel, are added to ``mask`` as stored."""
     for strip in strips:
         bits = (np.packbits(tile[..., 0], axis=1) for tile in tiles_of([strip[..., -1:] > 0]))
-        mask += [deflated(tile) for tile in bits]
+        mask += [_deflated(tile) for tile in bits]
         yield strip[..., :-1]
 
 
@@ -174,3 +176,31 @@ def copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:
             text = text.split("\0")[0].strip() if isinstance(text, str) else ""
             if text and text.isascii():
                 yield int(tag), 2, 0, text, True
+
+
+def tiles_of(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+    """Tiles in the order of the file; those at the right and lower border completed."""
+    for strip in strips:
+        for y in range(0, strip.shape[0], TILE):
+            for x in range(0, strip.shape[1], TILE):
+                tile = strip[y : y + TILE, x : x + TILE]
+                missing = [(0, TILE - n) for n in tile.shape[:2]] + [(0, 0)]
+                yield np.pad(tile, missing) if any(b for _, b in missing) else tile
+
+
+def has_predictor(dtype: np.dtype[Any]) -> bool:
+    """Check whether differences of neighbours are stored; what is usual for floating point, few programs can read."""
+    return dtype.kind == "u"
+
+
+def encoded_tile(tile: NDArray[Any]) -> bytes:
+    """A tile (h, w, C) as it stands in the file."""
+    stored = tile.copy()
+    if has_predictor(tile.dtype):
+        stored[:, 1:] -= tile[:, :-1]
+    return _deflated(stored)
+
+
+def _deflated(stored: NDArray[Any]) -> bytes:
+    """Compressed by libdeflate, which is fast, and makes the same bytes of the same samples every time."""
+    return bytes(imagecodecs.deflate_encode(stored.tobytes(), _DEFLATE_LEVEL))

@@ -32,7 +32,7 @@ class VideoFrame(NamedTuple):
 
 def grey_frames(path: Path) -> Iterator[NDArray[np.uint8] | None]:
     """All frames of a video, (H, W); None where one cannot be decoded."""
-    for _, _, capture in _grabbed(path):
+    for _, _, capture in grabbed_frames(path):
         decoded, frame = capture.retrieve()
         yield np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY), dtype=np.uint8) if decoded else None
 
@@ -44,7 +44,7 @@ def extract_frames(path: Path, folder: Path, wanted: Callable[[int], bool]) -> t
     """
     written: list[VideoFrame] = []
     damage, lost = "", 0
-    for number, timestamp, capture in _grabbed(path):
+    for number, timestamp, capture in grabbed_frames(path):
         count, rate = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
         cut_off = number + 1 < _CUT_OFF * count and timestamp * rate < _CUT_OFF * count
         damage = f"ends after {number + 1} of {count:.0f} frames; copy it again from its source" if cut_off else ""
@@ -60,7 +60,7 @@ def extract_frames(path: Path, folder: Path, wanted: Callable[[int], bool]) -> t
     return written, "; ".join([damage] * bool(damage) + [undecoded] * bool(lost))
 
 
-def _grabbed(path: Path) -> Iterator[tuple[int, float, cv2.VideoCapture]]:
+def grabbed_frames(path: Path) -> Iterator[tuple[int, float, cv2.VideoCapture]]:
     """Number and time, s, of each frame of a video, and what decodes it."""
     check_readable(path)
     with opened_capture(str(path)) as capture:

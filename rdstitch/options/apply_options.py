@@ -1,10 +1,9 @@
 """Options of composing again by a saved registration."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from rdstitch.choices import MatchBy
-from rdstitch.options.option import check_options, documented, option
+from rdstitch.options.option import Options, documented, option
 from rdstitch.options.shared_options import (
     ArrayChannels,
     DryRun,
@@ -15,13 +14,12 @@ from rdstitch.options.shared_options import (
     Strict,
     Topic,
     Workers,
-    files_in,
 )
 
 
 @documented
 @dataclass(frozen=True)
-class ApplyOptions:
+class ApplyOptions(Options):
     """Options of :func:`rdstitch.apply`; the command line has the same names and defaults.
 
     Which image takes whose place says ``match``: "name", the one of the same file name, of the same name before the
@@ -41,11 +39,3 @@ class ApplyOptions:
     strict: Strict = False
     dry_run: DryRun = False
     channel_order: ArrayChannels = "bgr"
-
-    @property
-    def files(self) -> list[Path]:
-        """The files that are read besides the images, none of which may be written over."""
-        return files_in(self.mask, self.flat_field if self.flat_field not in ("off", "auto") else None)
-
-    def __post_init__(self) -> None:
-        check_options(self)

@@ -2,29 +2,15 @@
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from rdstitch.choices import ProjectionName
 from rdstitch.errors import ArgumentError
 from rdstitch.options.option import Contradiction, documented, option
-from rdstitch.options.upright_options import TURN_CONTRADICTIONS, UprightOptions
+from rdstitch.options.upright_options import UprightOptions
 
 ExposureMethod = Literal["auto", "none", "exif", "gain", "blocks", "balanced"]
 Interpolation = Literal["linear", "cubic", "lanczos"]
-
-_CONTRADICTIONS = (
-    Contradiction(("gsd",), ("scale",), "scale and gsd both say how large the output is; leave one of them out"),
-    Contradiction(
-        ("like",),
-        ("gsd", "epsg", "scale", "rotate"),
-        "like says the size of pixels and the map; leave out gsd, crs, scale and rotate",
-    ),
-    Contradiction(
-        ("like", "extent"),
-        ("crop", "max_size"),
-        "like and extent say how large the output is; leave out crop and max_size",
-    ),
-)
 
 
 def _is_scalar(value: Any) -> bool:
@@ -36,6 +22,20 @@ def _is_scalar(value: Any) -> bool:
 class CompositeOptions(UprightOptions):
     """Options of the compositor, and of how the output is turned; the command line has the same names and defaults."""
 
+    contradictions: ClassVar[tuple[Contradiction, ...]] = (
+        *UprightOptions.contradictions,
+        Contradiction(("gsd",), ("scale",), "scale and gsd both say how large the output is; leave one of them out"),
+        Contradiction(
+            ("like",),
+            ("gsd", "epsg", "scale", "rotate"),
+            "like says the size of pixels and the map; leave out gsd, crs, scale and rotate",
+        ),
+        Contradiction(
+            ("like", "extent"),
+            ("crop", "max_size"),
+            "like and extent say how large the output is; leave out crop and max_size",
+        ),
+    )
     exposure: ExposureMethod = option(
         "auto",
         "Brightness: exif normalises by time, ISO and aperture, for measurements; gain makes all images comparable "
@@ -136,8 +136,7 @@ class CompositeOptions(UprightOptions):
         defaults = {each.name: each.default for each in fields(self)}
         # What turns nothing, crops nothing, or is left open contradicts nothing; scale=1 and straighten="off" do.
         stated = [name for name, value in given.items() if not (_is_scalar(value) and value in (None, "none", 0.0))]
-        contradictions = (*_CONTRADICTIONS, *TURN_CONTRADICTIONS)
-        replaced = {other for name in stated for each in contradictions for other in each.against(name)}
+        replaced = {other for name in stated for each in self.contradictions for other in each.against(name)}
         if {"scale", "gsd"} & given.keys():
             replaced.add("max_size")  # it would reduce them
         changed: dict[str, Any] = {name: defaults[name] for name in replaced} | given
@@ -149,8 +148,6 @@ class CompositeOptions(UprightOptions):
         super().__post_init__()
         if self.like is not None:
             object.__setattr__(self, "like", str(self.like))  # as the sidecar has it
-        for contradiction in _CONTRADICTIONS:
-            contradiction.refuse(self)
         if self.extent is not None and not (self.extent[0] < self.extent[2] and self.extent[1] < self.extent[3]):
             raise ArgumentError(f"extent must be west, south, east and north, not {self.extent}")
         if self.tile_size is not None and self.tile_size % 256:

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 from rdstitch.choices import SolverName
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import check_options, option
+from rdstitch.options.option import Options, option
 
 
 @dataclass(frozen=True)
-class RansacOptions:
+class RansacOptions(Options):
     """How the motion of a pair is searched: which solvers, what counts as agreement, and when to stop."""
 
     solver: SolverName = option("auto", "Minimal solver of the pairs.")
@@ -25,9 +25,6 @@ class RansacOptions:
     )
     max_iterations: int = option(10000, "Samples a pair, over all solvers.", least=1, command_line=False)
     seed: int = option(0, "Random seed.", least=0)
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def refuse_solver(self) -> None:
         """Refuse a solver where λ is known: which one is used depends on nothing else then."""

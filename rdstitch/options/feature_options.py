@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 from rdstitch.choices import FeatureName
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import check_options, documented, option
+from rdstitch.options.option import Options, documented, option
 
 WORK_MEGAPIXELS = 0.6
 """10⁶ pixels to which images of a large set are halved unless it is said otherwise."""
@@ -23,7 +23,7 @@ made λ of single pairs of a flight less certain, not more."""
 
 @documented
 @dataclass(frozen=True)
-class FeatureOptions:
+class FeatureOptions(Options):
     """Choice of the features to detect, and how many."""
 
     kind: FeatureName = option("rootsift", "Feature detector and descriptor.", flag="--features")
@@ -58,7 +58,7 @@ class FeatureOptions:
     )
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if self.kind == "aliked" and self.aliked_model is None:
             raise ArgumentError("features 'aliked' need the ONNX file of the network (--aliked-model)")
         if self.work_megapixels == 0:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from rdstitch.choices import PosesFrame
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import check_options, documented, option
+from rdstitch.options.option import Options, documented, option
 from rdstitch.options.shared_options import Height
 
 _REPORT_SUFFIXES = (".html", ".htm")
@@ -13,7 +13,7 @@ _REPORT_SUFFIXES = (".html", ".htm")
 
 @documented
 @dataclass(frozen=True)
-class FilesBeside:
+class FilesBeside(Options):
     """What is written beside an image, published together with it; the report of a result that is refused too."""
 
     report: Path | None = option(
@@ -57,7 +57,7 @@ class FilesBeside:
     command: str = ""  # the command line, for the report
 
     def __post_init__(self) -> None:
-        check_options(self)
+        super().__post_init__()
         if self.whole_layers and self.layers is None:
             raise ArgumentError("whole layers need a folder of layers: --whole-layers goes with --layers DIR")
         if self.report is not None:

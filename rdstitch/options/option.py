@@ -7,21 +7,19 @@ large is imported here or by the modules of the options, so that ``--help`` is q
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from inspect import isclass
+from itertools import chain
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, Any, ForwardRef, Literal, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, ClassVar, ForwardRef, Literal, TypeVar, Union, get_args, get_origin
 
 from rdstitch.errors import ArgumentError
 
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
 Class = TypeVar("Class", bound=type)
-Options = TypeVar("Options", bound="DataclassInstance")
+AnyOptions = TypeVar("AnyOptions", bound="Options")
 
 
 @dataclass(frozen=True)
@@ -42,6 +40,11 @@ class Option:
     writes: bool = False  # whether it names a file or folder that is written
     command_line: bool = True
     pixels: bool = False  # whether it says which pixels the output has
+
+    def names_read(self, value: Any) -> bool:
+        """Whether a value names a file or folder that is read."""
+        words = [word for word in self.metavar.split("|") if word.islower()]
+        return "FILE" in self.metavar and not self.writes and isinstance(value, str | PathLike) and value not in words
 
     def allows(self, number: float) -> bool:
         """Check a number by the limits."""
@@ -116,18 +119,52 @@ class Contradiction:
     others: tuple[str, ...]
     reason: str
 
-    def refuse(self, options: Any) -> None:
-        """Refuse options of both sides that are not their defaults."""
-        defaults = {each.name: each.default for each in fields(options)}
-        if all(any(getattr(options, n) != defaults[n] for n in side) for side in (self.names, self.others)):
-            raise ArgumentError(self.reason)
-
     def against(self, name: str) -> tuple[str, ...]:
         """Those that may not be given together with one."""
         return self.others if name in self.names else self.names if name in self.others else ()
 
 
-def with_fields(options: Options, given: dict[str, Any]) -> Options:
+class Options:
+    """Base of classes of options, which are dataclasses; text that names a file becomes a path, arrays tuples."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+    contradictions: ClassVar[tuple[Contradiction, ...]] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse a value that its field may not have, and what contradicts another one."""
+        for name, option in declared(self).items():
+            value = getattr(self, name)
+            if isinstance(value, str) and option.types == (Path,):
+                value = Path(value)
+            object.__setattr__(self, name, checked(option, value))
+        for each in fields(self):
+            kind: Any = each.default_factory
+            if isclass(kind) and issubclass(kind, Options) and not isinstance(getattr(self, each.name), kind):
+                raise ArgumentError(f"{each.name} must be {kind.__name__}, not {getattr(self, each.name)!r}")
+        for contradiction in self.contradictions:
+            if all(any(map(self._is_given, side)) for side in (contradiction.names, contradiction.others)):
+                raise ArgumentError(contradiction.reason)
+
+    def _is_given(self, name: str) -> bool:
+        value, default = getattr(self, name), self.__dataclass_fields__[name].default
+        return value is not None if default is None else bool(value != default)  # of an array, no truth is asked
+
+    @property
+    def files(self) -> list[Path]:
+        """The files that are read besides the images, none of which may be written over."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        named = [values[name] for name, each in declared(self).items() if each.option.names_read(values[name])]
+        within = [options.files for options in values.values() if isinstance(options, Options)]
+        return [*files_in(*named), *chain(*within)]
+
+
+def files_in(*named: str | Path | None) -> list[Path]:
+    """The files of these names; of folders, those in them."""
+    given = [Path(name) for name in named if name is not None]
+    return [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
+
+
+def with_fields(options: AnyOptions, given: dict[str, Any]) -> AnyOptions:
     """The same options with other values; a name that is none of theirs is refused."""
     known = [each.name for each in fields(options)]
     for name in given.keys() - set(known):
@@ -136,20 +173,6 @@ def with_fields(options: Options, given: dict[str, Any]) -> Options:
         close = "".join(f"; do you mean {each!r}?" for each in get_close_matches(name, known, n=1))
         raise ArgumentError(f"{type(options).__name__} has no option {name!r}{close}")
     return replace(options, **given)
-
-
-def check_options(options: Any) -> None:
-    """Refuse a value that its field may not have; text that names a file becomes a path, lists and arrays tuples."""
-    for name, option in declared(options).items():
-        value = getattr(options, name)
-        if isinstance(value, str) and option.types == (Path,):
-            value = Path(value)
-        object.__setattr__(options, name, checked(option, value))
-    for each in fields(options):
-        # Options within options.
-        kind: Any = each.default_factory
-        if isclass(kind) and is_dataclass(kind) and not isinstance(getattr(options, each.name), kind):
-            raise ArgumentError(f"{each.name} must be {kind.__name__}, not {getattr(options, each.name)!r}")
 
 
 def checked(option: Declared, value: Any) -> Any:

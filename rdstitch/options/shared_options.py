@@ -6,13 +6,6 @@ from typing import Annotated, Literal
 from rdstitch.choices import ChannelOrder
 from rdstitch.options.option import Option
 
-
-def files_in(*named: str | Path | None) -> list[Path]:
-    """The files of these names; of folders, those in them."""
-    given = [Path(name) for name in named if name is not None]
-    return [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
-
-
 Every = Annotated[
     int | None,
     Option(

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 from rdstitch.choices import CameraFormat, LensName, LocalAlignmentMode, ModelName
 from rdstitch.errors import ArgumentError
@@ -20,7 +20,6 @@ from rdstitch.options.shared_options import (
     Strict,
     Topic,
     Workers,
-    files_in,
 )
 from rdstitch.system.machine import processor_count
 
@@ -28,14 +27,6 @@ if TYPE_CHECKING:
     from rdstitch.geometry.camera import Camera
     from rdstitch.inputs.odometry import Odometry
 
-_CONTRADICTIONS = (
-    Contradiction(("lens",), ("distortion", "camera"), "the lens is known: leave out lens, or the known lens"),
-    Contradiction(
-        ("camera",),
-        ("distortion",),
-        "camera and distortion (--camera and --lambda) both say what the lens is; leave one of them out",
-    ),
-)
 _SELECT_MODEL_BELOW = 50
 """Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""
 
@@ -49,6 +40,14 @@ class StitchOptions(RansacOptions):
     A camera may also be given as the path of its file, or of a ROS bag with camera_info; a recipe reads it then.
     """
 
+    contradictions: ClassVar[tuple[Contradiction, ...]] = (
+        Contradiction(("lens",), ("distortion", "camera"), "the lens is known: leave out lens, or the known lens"),
+        Contradiction(
+            ("camera",),
+            ("distortion",),
+            "camera and distortion (--camera and --lambda) both say what the lens is; leave one of them out",
+        ),
+    )
     features: FeatureOptions = field(default_factory=FeatureOptions)
     ratio: float | None = option(
         None,
@@ -159,8 +158,6 @@ class StitchOptions(RansacOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for contradiction in _CONTRADICTIONS:
-            contradiction.refuse(self)
         if self.solver == "two_point" and self.tilt is None and (self.attitude is None or self.attitude_std > 0.0):
             raise ArgumentError("the two_point solver needs the tilt, or exact attitudes")
         if self.distortion is not None or self.camera is not None:
@@ -186,23 +183,6 @@ class StitchOptions(RansacOptions):
         if self.distortion is not None or self.known_camera is None:
             return self.distortion
         return self.known_camera.nearest_distortion
-
-    @property
-    def files(self) -> list[Path]:
-        """The files that are read besides the images, none of which may be written over."""
-        return files_in(
-            self.camera if isinstance(self.camera, str | Path) else None,
-            self.mask,
-            None if self.attitude == "xmp" else self.attitude,
-            self.timestamps,
-            self.odometry if isinstance(self.odometry, str | Path) else None,
-            self.positions,
-            self.gcp,
-            self.check_points,
-            self.lightglue_model,
-            self.features.aliked_model,
-            self.composite.like,
-        )
 
     @property
     def estimation(self) -> EstimationOptions:

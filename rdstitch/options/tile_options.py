@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from rdstitch.choices import Origin, ScanOrder, ZPlane
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.options.option import check_options, documented, option
-from rdstitch.options.shared_options import DryRun, FlatField, Overwrite, Strict, Topic, Workers, files_in
+from rdstitch.options.option import Contradiction, Options, documented, option
+from rdstitch.options.shared_options import DryRun, FlatField, Overwrite, Strict, Topic, Workers
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -22,13 +22,18 @@ def measured_samples() -> CompositeOptions:
 
 @documented
 @dataclass(frozen=True, eq=False)
-class TileOptions:
+class TileOptions(Options):
     """Options of :func:`rdstitch.tiles`; the command line has the same names and defaults.
 
     Besides a file, ``positions`` may be, of each tile in the order given, an array (N, 2) of x and y in pixels, or a
     dict or data frame with x, y or x_um, y_um. By default (``composite``) each sample of the image is one of a tile.
     """
 
+    contradictions: ClassVar[tuple[Contradiction, ...]] = (
+        Contradiction(
+            ("positions",), ("grid",), "positions and grid both say where the tiles are; leave one of them out"
+        ),
+    )
     positions: "str | Path | ArrayLike | Mapping[str, ArrayLike] | None" = option(
         None,
         "CSV with name,x,y (pixels) or name,x_um,y_um, or Fiji's TileConfiguration.txt; otherwise what OME-TIFF "
@@ -76,17 +81,7 @@ class TileOptions:
     workers: Workers = 0
     topic: Topic = None
 
-    @property
-    def files(self) -> list[Path]:
-        """The files that are read besides the images, none of which may be written over."""
-        return files_in(
-            self.positions if isinstance(self.positions, str | Path) else None,
-            None if self.flat_field in ("auto", "off") else self.flat_field,
-        )
-
     def __post_init__(self) -> None:
-        check_options(self)
-        if self.positions is not None and self.grid is not None:
-            raise ArgumentError("positions and grid both say where the tiles are; leave one of them out")
+        super().__post_init__()
         if (self.columns, self.order) != (None, "rows") and "{number}" not in (self.grid or ""):
             raise ArgumentError("columns and order say how running numbers are laid out: they go with {number} in grid")

@@ -1,25 +1,25 @@
 """How the output is turned between registration and canvas."""
 
 from dataclasses import dataclass, fields
-from typing import Literal
+from typing import ClassVar, Literal
 
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import Contradiction, check_options, option
+from rdstitch.options.option import Contradiction, Options, option
 
 Segment = tuple[float, float, float, float]
 Corners = tuple[float, float, float, float, float, float, float, float]
 
 _TURN = "rectangle, straighten and level each turn the output; give one of them"
-TURN_CONTRADICTIONS = (
-    Contradiction(("rectangle",), ("straighten", "level"), _TURN),
-    Contradiction(("straighten",), ("level",), _TURN),
-)
 
 
 @dataclass(frozen=True)
-class UprightOptions:
+class UprightOptions(Options):
     """How the output is turned."""
 
+    contradictions: ClassVar[tuple[Contradiction, ...]] = (
+        Contradiction(("rectangle",), ("straighten", "level"), _TURN),
+        Contradiction(("straighten",), ("level",), _TURN),
+    )
     yaw: float = option(0.0, "Turn the view of a panorama to the right, before it is projected.", "DEG")
     pitch: float = option(0.0, "Turn the view of a panorama up, before it is projected.", "DEG")
     roll: float = option(0.0, "Turn the view of a panorama clockwise, before it is projected.", "DEG")
@@ -38,9 +38,7 @@ class UprightOptions:
     level: bool = option(False, "Level the output by gravity (XMP, --attitude), otherwise by most images.")
 
     def __post_init__(self) -> None:
-        check_options(self)
-        for contradiction in TURN_CONTRADICTIONS:
-            contradiction.refuse(self)
+        super().__post_init__()
         if not isinstance(self.straighten, str) and any(line[:2] == line[2:] for line in self.straighten):
             raise ArgumentError("straighten: a line needs two different ends")
 

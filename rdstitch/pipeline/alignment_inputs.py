@@ -11,7 +11,7 @@ from rdstitch.alignment.least_squares.plane_marks import Sighting
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.measurements import metres_around_median, positions_of
+from rdstitch.inputs.positions import metres_around_median, positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.system.file_access import canonical_name

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from rdstitch.choices import Purpose
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.inputs.find import FoundImages, found_images
-from rdstitch.inputs.frame import Frame, Images, as_inputs
+from rdstitch.inputs.find import FoundImages
+from rdstitch.inputs.frame import Frame, Images
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import ImageSpec, write_strips
@@ -23,7 +24,7 @@ from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply_found, apply_run
 from rdstitch.pipeline.recipes import stitch_found
-from rdstitch.pipeline.run import Run
+from rdstitch.pipeline.run import started
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.read import read_sidecar
@@ -66,12 +67,17 @@ def mosaic_bands(
         raise ArgumentError("bands have no plan before the first of them is registered: leave out dry_run")
     files = [file.with_name(f"{file.stem}-{name}{file.suffix}") for name in bands]
     stack = [file, Path(f"{file}.json")] if file.suffix.lower() in (".tif", ".tiff") else []
-    given = as_inputs(inputs, options.channel_order)
-    run = Run.of(given, options, files[0], beside, progress)
-    with (
-        found_images(given, outputs=[file, *files], every=every, topic=options.topic) as listed,
-        Outputs(options.overwrite) as outputs,  # all are published together
-    ):
+    began = started(
+        inputs,
+        options,
+        Purpose.MOSAIC,
+        files[0],
+        every=every,
+        progress=progress,
+        beside=beside,
+        also_written=[file, *files[1:]],
+    )
+    with began as (listed, run, outputs):  # all are published together
         frames = selected(listed.frames, options.exclude, options.include_only)
         chosen = _by_band(frames, bands)
         _check_alike(dict(zip(bands, chosen, strict=True)), in_one_file=bool(stack))

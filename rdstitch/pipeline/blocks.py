@@ -5,19 +5,18 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
+from rdstitch.choices import Purpose
 from rdstitch.errors import InputError, OutputError, RdstitchError, RegistrationError
-from rdstitch.inputs.find import found_images
-from rdstitch.inputs.frame import Frame, Images, as_inputs
+from rdstitch.inputs.frame import Frame, Images
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.times import with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import stitch_found
-from rdstitch.pipeline.run import Run
+from rdstitch.pipeline.run import started
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.native_threads import one_native_thread
-from rdstitch.system.outputs import Outputs
 from rdstitch.system.progress import Progress, silent
 from rdstitch.system.temporary_folder import TemporaryFolder
 from rdstitch.verification.verdict import RefusedError
@@ -55,14 +54,10 @@ def mosaic_blocks(
     options, file = options or StitchOptions(), Path(output)
     results: list[StitchResult] = []
     refused: list[Message] = []
-    given = as_inputs(inputs, options.channel_order)
-    run = Run.of(given, options, file, beside, progress)
-    with ExitStack() as stack:
-        listed = stack.enter_context(found_images(given, outputs=[file], every=every, topic=options.topic))
+    began = started(inputs, options, Purpose.MOSAIC, file, every=every, progress=progress, beside=beside)
+    with began as (listed, run, outputs), ExitStack() as stack:  # all are published together
         # What was found of images and pairs serves the next block.
         cache = options.cache or stack.enter_context(TemporaryFolder())
-        # All are published together.
-        outputs = stack.enter_context(Outputs(options.overwrite))
         listed = replace(
             listed, frames=list(with_times(listed.frames, options.timestamps)), notes=(*listed.notes, *run.notes)
         )

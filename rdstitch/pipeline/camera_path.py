@@ -1,14 +1,33 @@
-"""The path of the camera, from where its images lie."""
+"""The path of the camera, from where its images lie and along the wheel odometry of the same drive."""
 
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
+from rdstitch.alignment.odometry import bridged, scaled_by_odometry
 from rdstitch.alignment.trajectory import Trajectory
-from rdstitch.inputs.odometry import Odometry
+from rdstitch.errors import InputError
+from rdstitch.inputs.frame import Frame, Named
+from rdstitch.inputs.odometry import Odometry, read_odometry
+from rdstitch.inputs.rosbag import is_bag, odometry_in_bag
+from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import timestamps_of
-from rdstitch.pipeline.along_odometry import along_odometry
-from rdstitch.results.messages import Message
+from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.results.messages import Message, shortened
 from rdstitch.results.registration import Registration
+
+
+def with_odometry_of_bag(inputs: Iterable[Named], options: StitchOptions) -> StitchOptions:
+    """Options with the odometry of a topic, if one is named, of the bag that is the input."""
+    named, topic = [Path(item) for item in inputs if not isinstance(item, Frame)], options.odometry
+    if topic is None or isinstance(topic, Odometry) or Path(topic).is_file() or not str(topic).startswith("/"):
+        return options
+    if len(named) != 1 or not is_bag(named[0]):
+        raise InputError(f"{topic}: no such file; a topic of odometry needs one ROS bag as input")
+    return replace(options, odometry=odometry_in_bag(named[0], str(topic)))
 
 
 def camera_path(
@@ -23,6 +42,33 @@ def camera_path(
     stored = QuarterTurns.of(sources).back.alignment(registration.alignment)
     path = Trajectory.from_alignment(stored, height or 1.0)
     if odometry is not None:
-        path, messages = along_odometry(path, sources, odometry, keep_unit=height is not None)
+        path, messages = _along_odometry(path, sources, odometry, keep_unit=height is not None)
     numbers = [source.number(k) for k, source in enumerate(sources)]
     return path.labelled([source.name for source in sources], numbers, timestamps_of(sources)), messages
+
+
+def _along_odometry(
+    path: Trajectory, sources: Sequence[Source], given: Odometry | str | Path, *, keep_unit: bool
+) -> tuple[Trajectory, list[Message]]:
+    """The path in the unit of the odometry, unless that is to be kept, with poses of all frames that it leads to."""
+    odometry = given if isinstance(given, Odometry) else read_odometry(given)
+    times = timestamps_of(sources)
+    found = {k: body for k, time in enumerate(times.tolist()) if (body := odometry.at(time)) is not None}
+    name = "the odometry" if isinstance(given, Odometry) else str(given)
+    if not found:
+        first, last = odometry.times[[0, -1]].tolist()
+        seen = times[np.isfinite(times)]
+        of = f"those of the images are from {seen.min():.3f} to {seen.max():.3f} s" if len(seen) else "images have none"
+        raise InputError(f"{name}: has times from {first:.3f} to {last:.3f} s, {of}; give --timestamps")
+    scaled = scaled_by_odometry(path, [found.get(int(k)) for k in path.frame], keep_unit=keep_unit)
+    if scaled is None:
+        return path, [Message(f"{name}: shows no motion of the images that have a pose; it is not used")]
+    path, fit = scaled
+    whole, messages = bridged(path, found, fit), []
+    if not keep_unit:
+        text = f"lengths are those of the odometry, ± {fit.relative_std:.1%}: the camera is at {path.height[0]:.4g}"
+        messages.append(Message(text, severity="note"))
+    seen_frames = set(path.frame.tolist())
+    if added := [sources[k].name for k in whole.frame.tolist() if k not in seen_frames]:
+        messages.append(Message(f"placed by the odometry alone: {shortened(added)}", severity="note"))
+    return whole, messages

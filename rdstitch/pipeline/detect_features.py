@@ -13,18 +13,18 @@ from functools import partial
 import numpy as np
 
 from rdstitch.arrays import IntArray
+from rdstitch.choices import Purpose
 from rdstitch.errors import InputError
 from rdstitch.executors import batches
 from rdstitch.features import FeatureOptions, Features, PackedFeatures, detect, detect_view
 from rdstitch.features.prepared_image import Stretch, common_stretch, halving, usual_stretch
-from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import FeatureStore, StoredFeatures
 from rdstitch.options.feature_options import CLOSER
+from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.run_on_sources import run_on_sources
 from rdstitch.system.cache import Cache
 from rdstitch.system.process_memory import reuse_freed_memory
-from rdstitch.system.progress import Progress
 
 _IMAGES_AT_ONCE, _MIN_BATCHES = 8, 16  # images of a task at the most; tasks at the least
 _USUAL_DENSITY = 2000
@@ -44,42 +44,28 @@ class DetectedFeatures:
     equalized: tuple[int, ...] = ()  # images whose local contrast was equalized, as they showed too little otherwise
 
 
-def detect_features(
-    sources: Sequence[Source],
-    options: FeatureOptions,
-    executor: Executor,
-    store: Cache,
-    guard: InputGuard,
-    *,
-    skip_bad: bool,
-    progress: Progress,
+def _detect_all(
+    sources: Sequence[Source], options: FeatureOptions, run: Run, executor: Executor, store: Cache
 ) -> DetectedFeatures:
-    """Detect the features of every image, several images at a time.
-
-    They lie in ``store``; with ``skip_bad`` damaged images are reported instead of raised.
-    """
+    """Detect the features of every image, several images at a time, into ``store``."""
     results: list[StoredFeatures | InputError] = []
     of_batch = partial(detect_batch, options=options, store=store)
     tasks = ((of_batch, batch) for batch in batches(sources, _IMAGES_AT_ONCE, _MIN_BATCHES))
-    for batch in run_on_sources(executor, tasks, guard):
+    for batch in run_on_sources(executor, tasks, run.guard):
         errors = [result for result in batch if isinstance(result, InputError)]
-        if errors and not skip_bad:
+        if errors and run.purpose is Purpose.PANO:
             raise errors[0]
         for result in batch:
             if isinstance(result, InputError):
-                guard.unreadable[sources[len(results)].path] = str(result)
+                run.guard.unreadable[sources[len(results)].path] = str(result)
             results.append(result)
-        progress("detecting features", len(results), len(sources))
-    return DetectedFeatures(
-        FeatureStore(
-            tuple(
-                StoredFeatures.of(_no_features(options, source)) if isinstance(result, InputError) else result
-                for source, result in zip(sources, results, strict=True)
-            )
-        ),
-        {index: str(result) for index, result in enumerate(results) if isinstance(result, InputError)},
-        options.stretch,
+        run.progress("detecting features", len(results), len(sources))
+    damaged = {index: str(result) for index, result in enumerate(results) if isinstance(result, InputError)}
+    features = (
+        StoredFeatures.of(_no_features(options, source)) if isinstance(result, InputError) else result
+        for source, result in zip(sources, results, strict=True)
     )
+    return DetectedFeatures(FeatureStore(tuple(features)), damaged, options.stretch)
 
 
 def detect_batch(
@@ -119,18 +105,18 @@ def _no_features(options: FeatureOptions, source: Source) -> Features:
 
 
 def detect_by_contrast(
-    sources: Sequence[Source],
-    options: FeatureOptions,
-    executor: Executor,
-    store: Cache,
-    guard: InputGuard,
-    *,
-    skip_bad: bool,
-    progress: Progress,
+    sources: Sequence[Source], options: FeatureOptions, run: Run, executor: Executor, store: Cache
 ) -> DetectedFeatures:
-    """Detect the features of all images, if necessary once more; see :func:`detect_features`."""
-    detect = partial(detect_features, executor=executor, store=store, guard=guard, skip_bad=skip_bad, progress=progress)
-    stretch_of = partial(_stretch_of, options=options, executor=executor, store=store, guard=guard)
+    """Detect the features of all images, if necessary once more.
+
+    They lie in ``store``; damaged images are reported, but of a panorama raised.
+    """
+    detect = partial(_detect_all, run=run, executor=executor, store=store)
+    of_one = partial(_stretch_of_one, megapixels=options.limits[1], store=store)
+
+    def stretch_of(images: Sequence[Source]) -> Stretch | None:
+        return common_stretch(list(run_on_sources(executor, ((of_one, [image]) for image in images), run.guard)))
+
     depths = {source.metadata.bit_depth > 8 for source in sources}
     stretch = options.stretch or (stretch_of(sources) if depths == {True} else None)
     options = replace(options, stretch=stretch)
@@ -172,14 +158,6 @@ def _of_low_contrast(sources: Sequence[Source], detected: DetectedFeatures, opti
 def _counts_of(features: Sequence[StoredFeatures]) -> IntArray:
     """Keypoints that each image shows at its working size, (N,)."""
     return np.array([item.detected_count for item in features], dtype=np.intp)
-
-
-def _stretch_of(
-    sources: Sequence[Source], *, options: FeatureOptions, executor: Executor, store: Cache, guard: InputGuard
-) -> Stretch | None:
-    """The stretch that suits all images together."""
-    of_one = partial(_stretch_of_one, megapixels=options.limits[1], store=store)
-    return common_stretch(list(run_on_sources(executor, ((of_one, [source]) for source in sources), guard)))
 
 
 def _stretch_of_one(sources: Sequence[Source], *, megapixels: float | None, store: Cache) -> Stretch | None:

@@ -8,8 +8,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, CompositeOptions
 from rdstitch.errors import ArgumentError
-from rdstitch.export.georeference import Georeference
-from rdstitch.export.georeference_text import check_summary, map_summary
+from rdstitch.export.georeference import Georeference, check_summary, map_summary
 from rdstitch.export.map_grid import MapGrid, grid_of_extent, read_grid
 from rdstitch.export.place_on_map import MIN_POSITIONS, has_place, place_on_map
 from rdstitch.geometry.crs import Crs

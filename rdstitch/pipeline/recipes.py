@@ -12,8 +12,8 @@ from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
 from rdstitch.errors import RegistrationError
 from rdstitch.export.trajectory_files import has_times, path_as_svg
 from rdstitch.export.write_trajectory import write_trajectory
-from rdstitch.inputs.find import FoundImages, found_images
-from rdstitch.inputs.frame import Images, as_inputs, frame_numbers
+from rdstitch.inputs.find import FoundImages
+from rdstitch.inputs.frame import Images, frame_numbers
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
@@ -23,7 +23,6 @@ from rdstitch.options.option import check_parameter
 from rdstitch.options.shared_options import Height
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import accept, scale_uncertainty
-from rdstitch.pipeline.along_odometry import with_odometry_of_bag
 from rdstitch.pipeline.camera_path import camera_path
 from rdstitch.pipeline.choose_layout import choose_layout
 from rdstitch.pipeline.compose import compose_images
@@ -33,9 +32,9 @@ from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.read_inputs import in_order, read_inputs
 from rdstitch.pipeline.realign import aligner_of, with_reference_of
 from rdstitch.pipeline.register import register
-from rdstitch.pipeline.remote_blocks import blocks_on
-from rdstitch.pipeline.run import Run
+from rdstitch.pipeline.run import Run, started
 from rdstitch.pipeline.run_files import RunFiles, check_world_files, report_refused, stage_beside
+from rdstitch.pipeline.run_on_sources import blocks_on
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.registration import Registration
@@ -94,7 +93,9 @@ def pano(
     >>> result.image.shape[2], result.ok
     (3, True)
     """
-    return _stitch(inputs, every, Purpose.PANO, output, options, beside, progress)
+    began = started(inputs, options, Purpose.PANO, output, every=every, progress=progress, beside=beside)
+    with began as (listed, run, outputs):
+        return stitch_found(listed, run, outputs)
 
 
 @one_native_thread()
@@ -138,26 +139,8 @@ def mosaic(
     >>> result.output.name, result.registration.alignment.used.all()
     ('small.tif', np.True_)
     """
-    return _stitch(inputs, every, Purpose.MOSAIC, output, options, beside, progress)
-
-
-def _stitch(
-    inputs: Images,
-    every: int | None,
-    purpose: Purpose,
-    output: str | Path | None,
-    options: StitchOptions | None,
-    beside: FilesBeside,
-    progress: Progress,
-) -> StitchResult:
-    """The stages of :func:`mosaic`, and, where every image must be readable and one gives the plane, :func:`pano`."""
-    options = options or StitchOptions()
-    given = as_inputs(inputs, options.channel_order)
-    run = Run.of(given, options, output, beside, progress, purpose)
-    with (
-        found_images(given, outputs=[run.output], every=every, topic=options.topic) as listed,
-        Outputs(options.overwrite) as outputs,
-    ):
+    began = started(inputs, options, Purpose.MOSAIC, output, every=every, progress=progress, beside=beside)
+    with began as (listed, run, outputs):
         return stitch_found(listed, run, outputs)
 
 
@@ -218,16 +201,11 @@ def calibrate(
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
     """
-    options = options or StitchOptions()
-    given = as_inputs(inputs, options.channel_order)
-    run = Run.of(given, options, None, beside, progress, Purpose.CALIBRATE)
-    with (
-        found_images(given, every=every, topic=options.topic) as listed,
-        Outputs(options.overwrite) as outputs,
-    ):
+    began = started(inputs, options, Purpose.CALIBRATE, every=every, progress=progress, beside=beside)
+    with began as (listed, run, outputs):
         RunFiles.of_images(run, listed.files).check(outputs)
         result = _registered(listed, run)
-        _save_camera(result, options, outputs)
+        _save_camera(result, run.options, outputs)
         return result.with_messages(stage_beside(run, outputs, result))
 
 
@@ -254,7 +232,7 @@ def trajectory(
         File to write.
     layout : str
         "csv", "tum" or "kitti", see :mod:`rdstitch.export.trajectory_files`; "bag": ``nav_msgs/Odometry``, see
-        :mod:`rdstitch.export.odometry_bag`.
+        :mod:`rdstitch.export.write_trajectory`.
     plot : path, optional
         SVG file to draw the path to.
     height : float, optional
@@ -272,18 +250,13 @@ def trajectory(
         check_parameter(name, kind, value)
     check_parameter("frame", TrajectoryFrame | None, frame)
     options = replace(options or StitchOptions(), pose_covariance=True)
-    given = as_inputs(inputs, options.channel_order)
-    options = with_odometry_of_bag(given, options)
-    run = Run.of(given, options, progress=progress, purpose=Purpose.TRAJECTORY)
-    with (
-        found_images(given, every=every, topic=options.topic) as listed,
-        Outputs(options.overwrite) as outputs,
-    ):
+    began = started(inputs, options, Purpose.TRAJECTORY, every=every, progress=progress)
+    with began as (listed, run, outputs):
         RunFiles.of_path(run, listed.files, output, plot, layout).check(outputs)
         numbers = frame_numbers(listed.frames)
         numbered = [replace(frame, number=k) for frame, k in zip(listed.frames, numbers, strict=True)]
         registration = _registered(replace(listed, frames=numbered), run)
-        path, of_path = camera_path(registration, options.odometry, height)
+        path, of_path = camera_path(registration, run.options.odometry, height)
         messages = [*scale_uncertainty(registration.alignment), *of_path]
         if layout in ("tum", "bag") and not has_times(path):
             messages.append(_NO_TIMES)

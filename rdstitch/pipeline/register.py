@@ -8,9 +8,8 @@ from functools import partial
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.sentences import explain_unaligned
-from rdstitch.choices import Purpose
 from rdstitch.features import LightGlue, match
-from rdstitch.inputs.measurements import positions_of
+from rdstitch.inputs.positions import positions_of
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import first_pairs
 from rdstitch.matching.mixed_lenses import separate_lenses
@@ -52,10 +51,7 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
         sources = with_image_circle(sources, executor, cache, run.guard, options.features.limits[1])
     aligner = Aligner.of(sources, options, cache, purpose)
     store = cache if options.cache is not None else Cache.for_this_run()
-    skip_bad = purpose is not Purpose.PANO
-    detected = detect_by_contrast(
-        sources, options.features, executor, store, run.guard, skip_bad=skip_bad, progress=progress
-    )
+    detected = detect_by_contrast(sources, options.features, run, executor, store)
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
     candidates = first_pairs(features, options.seed, positions_of(sources))

@@ -1,19 +1,23 @@
 """What all stages of one run have in common."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
 
 from rdstitch.choices import Purpose
 from rdstitch.executors import open_executor
-from rdstitch.inputs.frame import Named
+from rdstitch.inputs.find import FoundImages, found_images
+from rdstitch.inputs.frame import Images, Named, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.pipeline.camera_path import with_odometry_of_bag
 from rdstitch.pipeline.given_camera import with_camera
 from rdstitch.results.messages import Message
+from rdstitch.system.outputs import Outputs
 from rdstitch.system.progress import Progress, StageTimer, silent
 
 
@@ -41,8 +45,10 @@ class Run:
         progress: Progress = silent,
         purpose: Purpose = Purpose.MOSAIC,
     ) -> Self:
-        """Begin a run over inputs; the camera is read that options name, or that a bag has."""
+        """Begin a run over inputs; the camera, and the odometry of a path, are read that options name, or a bag has."""
         options = options or StitchOptions()
+        if purpose is Purpose.TRAJECTORY:
+            options = with_odometry_of_bag(inputs, options)
         known, notes = with_camera(options, inputs, of_bag=purpose is not Purpose.CALIBRATE)
         file, timer, guard = None if output is None else Path(output), StageTimer(progress), InputGuard(options.strict)
         return cls(known, file, beside, timer, purpose, guard, options.files, notes)
@@ -51,3 +57,26 @@ class Run:
         """Where the tasks of so many images are computed; to be used in a ``with`` block."""
         options = self.options
         return open_executor(options.threads, images, scheduler=options.scheduler, store=options.cache)
+
+
+@contextmanager
+def started(
+    inputs: Images,
+    options: StitchOptions | None,
+    purpose: Purpose,
+    output: str | Path | None = None,
+    *,
+    every: int | None,
+    progress: Progress,
+    beside: FilesBeside = NOTHING_BESIDE,
+    also_written: Sequence[Path] = (),
+) -> Iterator[tuple[FoundImages, Run, Outputs]]:
+    """Find images, none of which is among the outputs, and begin a run over them; files are published in the end."""
+    options = options or StitchOptions()
+    given = as_inputs(inputs, options.channel_order)
+    run = Run.of(given, options, output, beside, progress, purpose)
+    with (
+        found_images(given, outputs=[run.output, *also_written], every=every, topic=options.topic) as listed,
+        Outputs(options.overwrite) as outputs,
+    ):
+        yield listed, run, outputs

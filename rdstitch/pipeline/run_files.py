@@ -10,9 +10,9 @@ from rdstitch.choices import TrajectoryFormat
 from rdstitch.export.georeference import world_file_paths
 from rdstitch.export.layers import layer_files, stage_layers
 from rdstitch.export.map_server import check_map_server, map_files, write_map
-from rdstitch.export.odometry_bag import check_bag
 from rdstitch.export.place_on_map import has_place
-from rdstitch.export.poses_of_result import poses_file
+from rdstitch.export.poses_files import poses_file
+from rdstitch.export.write_trajectory import check_bag
 from rdstitch.inputs.source import Source
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message

@@ -1,13 +1,17 @@
-"""Work on images that workers do, wherever they are, and what they notice of the files meanwhile."""
+"""Work on images, and blocks of outputs, that workers do; and what they notice of the files meanwhile."""
 
 from collections.abc import Callable, Generator, Iterable, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
+from pathlib import Path
 from typing import TypeVar
 
+from rdstitch.compositing.tiles import Block, BlockRunner, OutputStrip
 from rdstitch.executors import in_order
 from rdstitch.inputs.input_guard import GuardState, InputGuard
 from rdstitch.inputs.source import Source
+from rdstitch.system.cache import Cache, Stored
 
 Result = TypeVar("Result")
 SourceTask = tuple[Callable[[Sequence[Source]], Result], Sequence[Source]]
@@ -27,3 +31,26 @@ def _result_and_state(task: SourceTask[Result]) -> tuple[Result, GuardState]:
     function, sources = task
     result = function(sources)
     return result, sources[0].guard.state_of([source.path for source in sources]) if sources else ({}, {})
+
+
+def blocks_on(
+    executor: Executor, sources: Sequence[Source], guard: InputGuard, folder: Path | None
+) -> BlockRunner | None:
+    """What computes blocks of an output on the workers of an executor; None for threads, which need no blocks.
+
+    ``folder`` is what all machines see by the same name, for the strips; None where there is one machine.
+    """
+    if isinstance(executor, ThreadPoolExecutor):
+        return None
+
+    def run(blocks: Iterable[Block]) -> Generator[list[Stored[OutputStrip]]]:
+        store = Cache.for_this_run(folder)
+        tasks = ((partial(compose_block, block, store), [sources[k] for k in block.images]) for block in blocks)
+        yield from run_on_sources(executor, tasks, guard)
+
+    return run
+
+
+def compose_block(block: Block, store: Cache, _sources: Sequence[Source]) -> list[Stored[OutputStrip]]:
+    """Compute a block, which reads these images, into a store."""
+    return block.compute(store)

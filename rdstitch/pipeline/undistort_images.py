@@ -19,7 +19,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.write import write_image
-from rdstitch.options.shared_options import files_in
+from rdstitch.options.option import files_in
 from rdstitch.pipeline.given_camera import read_camera
 from rdstitch.results.messages import Message, ignored
 from rdstitch.system.native_threads import one_native_thread

@@ -14,7 +14,7 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.frame import Frame, files_of
-from rdstitch.inputs.measurements import metres_around_median
+from rdstitch.inputs.positions import metres_around_median
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.opening import check_readable
 from rdstitch.results.messages import Message, names_of, shortened

@@ -3,7 +3,7 @@
 import selectors
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import thread
 from contextlib import contextmanager
 from typing import Any
@@ -17,8 +17,6 @@ _logging: Any = getattr(cv2.utils, "logging", cv2)
 _WAITING = {threading.Condition.wait.__code__, selectors.DefaultSelector.select.__code__}
 # That of idle pools has a private name; where it has another one, a pool that was begun meanwhile counts as busy.
 _WAITING |= {worker.__code__ for worker in (getattr(thread, "_worker", None),) if worker is not None}
-_lock = threading.Lock()
-_silenced: list[int] = []  # the log level before each of the blocks that hold it
 
 
 @contextmanager
@@ -48,16 +46,31 @@ def _others_wait() -> bool:
     return all((frame := frames.get(thread.ident or 0)) and frame.f_code in _WAITING for thread in others)
 
 
-@contextmanager
-def silent_opencv() -> Iterator[None]:
-    """Keep OpenCV from logging what an exception or a return value says already."""
-    with _lock:
-        _silenced.append(_silenced[0] if _silenced else _logging.getLogLevel())
-        _logging.setLogLevel(_SILENT)
-    try:
-        yield
-    finally:
-        with _lock:
-            before = _silenced.pop()
-            if not _silenced:
-                _logging.setLogLevel(before)
+class HeldState:
+    """A number that belongs to the whole process, and is another one while any of several blocks lasts.
+
+    The last block to end, which may be in another thread, gives back what was before all of them.
+    """
+
+    def __init__(self, read: Callable[[], int], write: Callable[[int], object], inside: int) -> None:
+        self.read, self._write, self._inside = read, write, inside
+        self._lock, self._blocks, self._before = threading.Lock(), 0, inside
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold it inside the block."""
+        with self._lock:
+            self._before = self._before if self._blocks else self.read()
+            self._blocks += 1
+            self._write(self._inside)
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._blocks -= 1
+                if not self._blocks:
+                    self._write(self._before)
+
+
+silent_opencv = HeldState(_logging.getLogLevel, _logging.setLogLevel, _SILENT).held
+"""Keeps OpenCV from logging what an exception or a return value says already."""

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from rdstitch.choices import TrajectoryFormat, TrajectoryFrame
+from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
 from rdstitch.options.feature_options import FeatureOptions
 from rdstitch.options.option import Option
 from rdstitch.options.shared_options import Every, Height
@@ -65,7 +65,6 @@ def trajectory(
     poses are printed as frames arrive.
     """
     from rdstitch.export.trajectory_files import frame_of
-    from rdstitch.pipeline.along_odometry import with_odometry_of_bag
     from rdstitch.pipeline.recipes import trajectory as recipe
     from rdstitch.pipeline.run import Run
     from rdstitch.pipeline.run_files import RunFiles
@@ -75,7 +74,7 @@ def trajectory(
     with ExitStack() as stack:
         paths: Sequence[Named]
         if following:
-            run = Run.of(inputs, with_odometry_of_bag(inputs, options))
+            run = Run.of(inputs, options, purpose=Purpose.TRAJECTORY)
             files, options = RunFiles.of_path(run, inputs, output, plot, file_format), run.options
             poses = FollowedPoses(height, frame or frame_of(file_format))
             paths = stack.enter_context(followed(inputs, run, files, reporter, every=every, idle=idle, poses=poses))

@@ -14,10 +14,9 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import camera_file_text
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, OutputError
-from rdstitch.export.georeference import Georeference, world_file_paths
-from rdstitch.export.georeference_text import map_summary
+from rdstitch.export.georeference import Georeference, map_summary, world_file_paths
 from rdstitch.export.place_on_map import Located, place_on_map
-from rdstitch.export.poses_of_result import poses_file, poses_table
+from rdstitch.export.poses_files import poses_file, poses_table
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
 from rdstitch.geometry.places import GpsPosition, GroundControl

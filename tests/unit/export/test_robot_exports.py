@@ -14,7 +14,7 @@ from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import ArgumentError, LimitError, OutputError
 from rdstitch.export import map_server
-from rdstitch.export.poses_of_result import poses_file
+from rdstitch.export.poses_files import poses_file
 from rdstitch.export.write_trajectory import write_trajectory
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel

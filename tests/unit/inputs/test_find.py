@@ -196,7 +196,7 @@ def test_frames_that_cannot_be_decoded_are_counted(tmp_path: Path, monkeypatch: 
         def retrieve(self) -> tuple[bool, NDArray[np.uint8] | None]:
             return (True, np.zeros((48, 64, 3), np.uint8)) if self.number != 1 else (False, None)
 
-    monkeypatch.setattr(video_reader, "_grabbed", lambda path: ((k, k / 25.0, Faulty(k)) for k in range(3)))
+    monkeypatch.setattr(video_reader, "grabbed_frames", lambda path: ((k, k / 25.0, Faulty(k)) for k in range(3)))
     found = find_images([clip], frames_folder=lambda: tmp_path, every=1)
     assert len(found.frames) == 2
     assert [message.text for message in found.messages] == ["1 frame cannot be decoded and is left out"]

@@ -16,8 +16,7 @@ from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.attitudes import with_attitudes
 from rdstitch.inputs.find import find_images
 from rdstitch.inputs.ground_control import with_ground_control
-from rdstitch.inputs.measurements import positions_of
-from rdstitch.inputs.positions import with_positions
+from rdstitch.inputs.positions import positions_of, with_positions
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.inputs.times import timestamps_of, with_times
 from rdstitch.io.metadata import Metadata

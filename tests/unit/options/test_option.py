@@ -11,12 +11,12 @@ import pytest
 import rdstitch
 from rdstitch import Camera, CompositeOptions, StitchOptions, TileOptions
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import Option, check_options, documented
+from rdstitch.options.option import Option, Options, documented
 
 
 @documented
 @dataclass(frozen=True)
-class _Options:
+class _Options(Options):
     """Some."""
 
     number: Annotated[float, Option("A number.", above=0.0, most=10.0)] = 1.0
@@ -27,9 +27,6 @@ class _Options:
     names: Annotated[tuple[str, ...], Option("Names.")] = ()
     file: Annotated[Path | None, Option("A file.")] = None
     switch: Annotated[bool, Option("On or off.")] = False
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
 
 @pytest.mark.parametrize(
@@ -141,6 +138,13 @@ def test_what_contradicts_or_is_unknown_is_refused() -> None:
             rdstitch.trajectory("none", **wrong)
 
 
-def test_a_grid_to_keep_is_an_input_that_no_output_may_replace(tmp_path: Path) -> None:
-    grid = tmp_path / "grid.tif"
-    assert grid in StitchOptions(composite=CompositeOptions(like=str(grid))).files
+def test_files_that_are_read_are_inputs_that_no_output_may_replace(tmp_path: Path) -> None:
+    (mask := tmp_path / "mask.png").touch()
+    grid = CompositeOptions(like=tmp_path / "grid.tif")
+    given: dict[str, Any] = {"attitude": "xmp", "save_camera": "new.json", "reference": "a", "cache": tmp_path}
+    options = StitchOptions(**given, camera="old.json", mask=tmp_path, odometry="/odom", composite=grid)
+    assert {*options.files} == {Path("old.json"), mask, Path("/odom"), tmp_path / "grid.tif"}
+    assert TileOptions(flat_field="auto", positions=np.zeros((2, 2))).files == []
+    assert TileOptions(flat_field="flat.tif", positions="p.csv").files == [Path("p.csv"), Path("flat.tif")]
+    with pytest.raises(ArgumentError, match="positions and grid"):
+        TileOptions(positions=np.zeros((2, 2)), grid="{row}")

@@ -12,10 +12,10 @@ import numpy as np
 import rdstitch
 from rdstitch.system.native_threads import _openblas, one_native_thread
 
-functions = _openblas()
-if functions is None:
+state = _openblas()
+if state is None:
     raise SystemExit(77)
-threads, _ = functions
+threads = state.read
 before, during = threads(), set()
 scene = cv2.resize(np.random.default_rng(0).integers(0, 255, (30, 50), dtype=np.uint8), (150, 90))
 how = rdstitch.StitchOptions(distortion=0.0, focal=100.0, force=True, workers=2)
