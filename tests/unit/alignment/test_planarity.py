@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rdstitch.alignment.least_squares.link_equations import squared_lengths
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.noise import Coherence, coherence, evidence_of, shared_variance
@@ -131,10 +130,6 @@ def test_links_measure_points_again_and_only_inliers_of_links_that_fit_count() -
 
 def test_there_are_two_observations_at_least() -> None:
     assert _found(np.full((1, 1, 2), 0.3), 2)[1] == 2.0
-
-
-def test_what_cannot_be_transferred_is_infinitely_off() -> None:
-    assert squared_lengths(np.array([[3.0, 4.0], [np.nan, 1.0]])).tolist() == [25.0, np.inf]
 
 
 @pytest.mark.parametrize(("sigma", "noise"), [(0.5, 0.5), (0.01, MODEL_ERROR)])
