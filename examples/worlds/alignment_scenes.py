@@ -169,5 +169,5 @@ def fitted(given: Scene) -> tuple[Problem, Fit]:
     free = np.arange(5) == 0
     trust = np.ones(len(given.links))
     lens = np.array([given.distortion, 0.0, 0.0, 0.0, 0.0])
-    problem = Problem(observations, homographies, trust, count, 0, lens, free, known)
+    problem = Problem(observations, homographies, lens, free, known, trust=trust, count=count, fixed=0)
     return problem, fit_model(problem, SIMILARITY)

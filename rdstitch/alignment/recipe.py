@@ -126,10 +126,10 @@ def _problem_of_all_links(
     given: GivenImages, sample: Observations, lens: LensChoice, trust: FloatArray, known: CameraPriors, wrong: BoolArray
 ) -> Problem:
     """The problem of all images, with the reference that was asked for, or else a good one of those not ``wrong``."""
-    pairwise, reference = lens.pairwise, given.options.reference
-    count, start = len(given.cameras), pairwise.parameters.lens
+    homographies, start = lens.pairwise.homographies, lens.pairwise.parameters.lens
+    count, reference = len(given.cameras), given.options.reference
     all_links = Problem(
-        sample, pairwise.homographies, trust, count, reference, start, lens.free, known, min_gain=FEW_GAIN
+        sample, homographies, start, lens.free, known, trust=trust, count=count, fixed=reference, min_gain=FEW_GAIN
     )
     if reference is None:
         problem, images = all_links.part(~wrong)

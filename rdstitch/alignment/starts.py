@@ -80,8 +80,7 @@ def _one_camera_links(
     elif shared is None:
         adjuster, at = best_trial(problem, model)
         shared = (at if len(problem.observations) == 1 else adjuster.run(at).parameters).shared
-    poses = nearest_pairs(model, problem.observations, problem.homographies, shared, problem.camera_priors.attitudes)
-    matrices = model.matrices(poses, shared).matrices
+    matrices = model.matrices(nearest_pairs(problem, model, shared), shared).matrices
     return shared, matrices[1::2] @ inverses(matrices[0::2])
 
 

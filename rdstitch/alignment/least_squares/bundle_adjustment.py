@@ -22,7 +22,7 @@ from rdstitch.alignment.least_squares.normal_equations import ImageEquations, Sp
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import ModelMatrices, MotionModel
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.levenberg_marquardt import MAX_DAMPING, damping_by_gain
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
@@ -66,7 +66,7 @@ class FreeParameters:
     lens: BoolArray
 
     @classmethod
-    def fixing(cls, model: MotionModel, count: int, references: FloatArray | list[int], lens: BoolArray) -> Self:
+    def fixing(cls, model: MotionModel, count: int, references: IntArray | list[int], lens: BoolArray) -> Self:
         """All but the gauge of the reference images, one for each connected part of the graph."""
         poses = np.ones((count, model.pose_size), dtype=np.bool_)
         poses[np.asarray(references, dtype=np.intp)] = ~model.gauge

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from examples.worlds.alignment_scenes import Scene, grid, grid_scene, scene
+from rdstitch.alignment.adjustment_problem import LinkProblem
 from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links, triangles
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
@@ -100,7 +101,7 @@ def _apart(given: Scene, links: list[Link]) -> tuple[BundleAdjustmentResult, Obs
     lens[0] = given.distortion
     relations = relations_at(observations, [link.relation for link in links], lens)
     known = AlignmentOptions().camera_priors(given.cameras)
-    return pairwise_homographies(observations, relations, lens, lens != 0.0, known), observations
+    return pairwise_homographies(LinkProblem(observations, relations, lens, lens != 0.0, known)), observations
 
 
 def test_a_fit_that_ran_away_is_suspected_and_says_nothing_of_others() -> None:

@@ -12,7 +12,7 @@ import pytest
 from examples.worlds.alignment_scenes import Scene, aligned, grid_scene
 from examples.worlds.lens_scenes import FISHEYE, SIZE, lens_distance, lens_scene
 from rdstitch.alignment import LENSES, Alignment, AlignmentOptions
-from rdstitch.alignment.least_squares.observations import Observations
+from rdstitch.alignment.adjustment_problem import LinkProblem
 from rdstitch.alignment.lens import lens_selection
 from rdstitch.alignment.lens.lens_description import describe_lens, radius_std
 from rdstitch.alignment.lens.lens_selection import LensChoice, free_parameters
@@ -63,9 +63,9 @@ def test_some_of_very_many_links_show_the_lens(monkeypatch: pytest.MonkeyPatch) 
     given, every = fisheye_alignment()
     sizes = []
 
-    def noted(seen: Observations, *others: Any) -> Any:
-        sizes.append(len(seen))
-        return pairwise_homographies(seen, *others)
+    def noted(links: LinkProblem) -> Any:
+        sizes.append(len(links.observations))
+        return pairwise_homographies(links)
 
     monkeypatch.setattr(lens_selection, "pairwise_homographies", noted)
     monkeypatch.setattr(lens_selection, "_ENOUGH_LINKS", len(given.links) // 2)
@@ -214,8 +214,8 @@ def test_all_images_together_show_a_third_coefficient_that_pairs_do_not(monkeypa
     given = lens_scene(replace(FISHEYE, distortion2=-0.03, distortion3=-0.03), 0)
     chosen = []
 
-    def choose(seen: Observations, apart: Any, names: object, known: Any) -> LensChoice:
-        chosen.append(lens_selection.choose_lens(seen, apart, ["division", "division2"], known))
+    def choose(links: LinkProblem, apart: Any, names: object) -> LensChoice:
+        chosen.append(lens_selection.choose_lens(links, apart, ["division", "division2"]))
         return chosen[-1]
 
     monkeypatch.setattr(observability, "choose_lens", choose)
