@@ -11,11 +11,15 @@ import numpy as np
 from examples.worlds.alignment_scenes import grid, scene
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.choices import Purpose
+from rdstitch.executors import open_executor
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.source import Source
+from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.mask import Mask
 from rdstitch.io.metadata import Metadata
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.pipeline.register import register
+from rdstitch.pipeline.run import Run
 from rdstitch.results.registration import Registration
 from rdstitch.verification.evidence import ResultEvidence
 
@@ -46,6 +50,13 @@ def registration(
     sources = [source(f"{name}.jpg") for name in "abcdef"[:images]] if isinstance(images, int) else images
     found = replace(_aligned(max(2, len(sources))), **alignment)
     return Registration(tuple(sources), tuple(keypoints), tuple(pairs), found, (), mixed=mixed)
+
+
+def registered(frames: Sequence[Path], options: StitchOptions, focal: float | None = 380.0) -> Registration:
+    """Of images in files."""
+    sources, _ = read_sources(frames, focal=focal, distortion=options.distortion, skip_bad=False)
+    with open_executor(1, len(sources)) as executor:
+        return register(sources, Run(options), executor)
 
 
 def evidence(

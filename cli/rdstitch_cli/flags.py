@@ -25,10 +25,7 @@ _GOES_ON = "the same command goes on from the cache"  # note at an interrupt
 
 
 def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callable[..., Any]], click.Command]:
-    """A command of a function: its parameters with options become flags, and so do the options given.
-
-    Values of those arrive as ``**given``; -q and -v as ``reporter``.
-    """
+    """A command of a function: flags of its parameters and of the options given, whose values arrive as ``**given``."""
 
     def make(function: Callable[..., Any]) -> click.Command:
         @wraps(function)
@@ -69,12 +66,6 @@ def flags_of(options: Any, *, only: str = "", without: str = "") -> list[click.O
     if only:
         chosen = [option for option in chosen if option.name in only.split()]
     return [_flag(o, getattr(options, o.name)) for o in chosen if o.name not in without.split()]
-
-
-def flags(**options: tuple[Any, Any]) -> list[click.Option]:
-    """Flags by the names of parameters: their annotations and defaults."""
-    found = ((declaration(name, annotation), default) for name, (annotation, default) in options.items())
-    return [_flag(option, default) for option, default in found if option is not None]
 
 
 def values_of(kind: Any, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -152,10 +143,7 @@ def _check_not_read(written: Iterable[Path], camera: Path | None) -> None:
 
 
 class FilePath(click.Path):
-    """A file or folder, or a word that stands for something else; a file of that name is written ``./word``.
-
-    Whether a file can be read is for the library to find out: it knows more, and has an exit status for it.
-    """
+    """A file or folder, which the library checks, or a word that stands for something else; ``./word`` is a file."""
 
     def __init__(self, words: Sequence[str] = (), *, allow_dash: bool = False) -> None:
         super().__init__(path_type=Path, readable=False, allow_dash=allow_dash)

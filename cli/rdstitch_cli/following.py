@@ -11,7 +11,6 @@ import click
 
 from rdstitch.options.option import Option
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch_cli.flags import flags
 from rdstitch_cli.stitching import warn_of
 from rdstitch_cli.terminal import Reporter
 
@@ -23,31 +22,23 @@ if TYPE_CHECKING:
     from rdstitch.results.pose import FollowedPoses
     from rdstitch.results.registration import Registration
 
-FOLLOWING = flags(
-    following=(
-        Annotated[
-            bool,
-            Option(
-                "Register frames as they arrive, and print a line of JSON for each: INPUT is a folder that grows, - "
-                "for names on standard input, a video, the index of a camera, or a stream. All are registered "
-                "together at the end: of the video or the names, after --idle, or with Ctrl-C.",
-                flag="--follow",
-            ),
-        ],
-        False,
+Following = Annotated[
+    bool,
+    Option(
+        "Register frames as they arrive, and print a line of JSON for each: INPUT is a folder that grows, - "
+        "for names on standard input, a video, the index of a camera, or a stream. All are registered "
+        "together at the end: of the video or the names, after --idle, or with Ctrl-C.",
+        flag="--follow",
     ),
-    idle=(
-        Annotated[
-            float | None,
-            Option(
-                "With --follow: end after so long without a frame; otherwise a folder is followed until Ctrl-C.",
-                "SECONDS",
-                above=0.0,
-            ),
-        ],
-        None,
+]
+Idle = Annotated[
+    float | None,
+    Option(
+        "With --follow: end after so long without a frame; otherwise a folder is followed until Ctrl-C.",
+        "SECONDS",
+        above=0.0,
     ),
-)
+]
 
 
 @contextmanager
@@ -63,10 +54,7 @@ def followed(
     refresh: float = 0.0,
     poses: "FollowedPoses | None" = None,
 ) -> Iterator[list["Named"]]:
-    """Print a line for each frame as it arrives; then, inside the block, what all of them are as inputs of a recipe.
-
-    ``files`` are those of the recipe, and ``poses`` says how poses are printed: as the recipe writes them.
-    """
+    """Print a line for each frame as it arrives; then, inside the block, what all of them are as inputs of a recipe."""
     from rdstitch.inputs.frame_stream import open_frame_stream
     from rdstitch.system.file_access import file_state
     from rdstitch.system.outputs import Outputs

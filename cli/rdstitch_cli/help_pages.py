@@ -57,10 +57,7 @@ def _show_all(context: click.Context, _option: click.Parameter, wanted: bool) ->
 
 
 class GroupedCommand(click.Command):
-    """A command whose help page shows its options in groups; of many, first those that matter.
-
-    ``--help-all`` shows all of them.
-    """
+    """A command whose page shows its options in groups; of many those that matter, and all with ``--help-all``."""
 
     def __init__(self, *arguments: Any, **given: Any) -> None:
         super().__init__(*arguments, **given)

@@ -176,10 +176,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _invoke(arguments: list[str]) -> int:
-    """Run the command; its results are written when this returns.
-
-    Not :meth:`click.Command.main`, which has its own opinions on interrupts and closed pipes.
-    """
+    """Run the command and write its results; :meth:`click.Command.main` has its own ideas of interrupts and pipes."""
     if completion := os.environ.get("_RDSTITCH_COMPLETE"):
         return shell_complete(cli, {}, "rdstitch", "_RDSTITCH_COMPLETE", completion)
     if not arguments:  # click before 8.2 takes this for success

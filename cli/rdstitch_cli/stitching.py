@@ -16,7 +16,7 @@ from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.option import Option
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import bytes_in_words, seconds_in_words
-from rdstitch_cli.flags import flags, flags_of, is_given, values_of
+from rdstitch_cli.flags import flags_of, is_given, values_of
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
@@ -25,22 +25,17 @@ if TYPE_CHECKING:
     from rdstitch.results.stitch_result import StitchResult
     from rdstitch.sidecar.recomposition import Recomposition
 
+Preview = Annotated[
+    bool,
+    Option(
+        "A quick draft of at most 1200 pixels: few features of reduced images, straight seams; options "
+        "given take precedence."
+    ),
+]
 STITCHING = [
     *flags_of(StitchOptions, without="odometry"),
     *flags_of(FeatureOptions),
     *flags_of(CompositeOptions),
-    *flags(
-        preview=(
-            Annotated[
-                bool,
-                Option(
-                    "A quick draft of at most 1200 pixels: few features of reduced images, straight seams; options "
-                    "given take precedence."
-                ),
-            ],
-            False,
-        )
-    ),
 ]
 """The options of every command that composes the images that it registers."""
 
@@ -56,9 +51,9 @@ def resolve(inputs: tuple[Path, ...]) -> list[Path]:
     return named
 
 
-def stitch_options(given: Mapping[str, Any], **more: Any) -> StitchOptions:
+def stitch_options(given: Mapping[str, Any], *, preview: bool = False, **more: Any) -> StitchOptions:
     """The library's options from a command's flags."""
-    if given.get("preview"):
+    if preview:
         quick = {"seam": "voronoi", "max_features": 1500, "work_megapixels": 0.5}
         if not (is_given("like") or is_given("extent")):
             quick["max_size"] = 1200  # they say the size too
@@ -76,9 +71,7 @@ def files_beside(given: Mapping[str, Any]) -> FilesBeside:
 
 
 def report_result(result: "StitchResult", reporter: Reporter, *, as_json: bool, more: str = "") -> None:
-    """λ and the plan of a dry run, or the sidecar, to standard output; what the user must know, and what was made, to
-    standard error.
-    """
+    """λ and the plan of a dry run, or the sidecar, to standard output; all else to standard error."""
     from rdstitch.sidecar.write import sidecar
 
     report_registration(result.registration, reporter, partial(sidecar, result) if as_json else None)

@@ -55,11 +55,7 @@ def one_line(text: str) -> str:
 
 
 class Reporter:
-    """Receives what the library has to say while it works.
-
-    It is the ``progress`` callable of the library: called with a stage's name, how much is done and how much there is
-    to do.
-    """
+    """Receives what the library has to say while it works: it is its ``progress`` callable."""
 
     def __init__(self, verbosity: int) -> None:
         self._verbosity = verbosity

@@ -27,7 +27,7 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.choices import Purpose
 from rdstitch.geometry.division_model import undistort
 from rdstitch.geometry.radial_homography import inverses
-from rdstitch.robust.posterior import TWENTY_TO_ONE, ErrorCost, Evidence, freedom_cost
+from rdstitch.robust.posterior import TWENTY_TO_ONE, Evidence
 
 _GRID = np.stack(np.meshgrid([-0.8, 0.0, 0.8], [-0.6, 0.0, 0.6]), axis=-1).reshape(-1, 2)
 """Half diagonals: points of an image of usual proportions, out to the corners."""
@@ -122,31 +122,31 @@ class Posterior:
         return evidence_of(self.problem.observations, self.link_errors)
 
     @cached_property
-    def floor(self) -> ErrorCost:
-        """What the errors of links on their own say, which those of no model undercut by much."""
-        return self.evidence.cost(self.link_errors)
+    def least_field(self) -> float:
+        """Pixels: what neighbours share of the errors of links on their own, which no model undercuts by much."""
+        return float(self.evidence.cost(self.link_errors).field[0])
 
     def scored(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
-        errors = self.evidence.cost(fit.adjusted.errors)
+        field = float(self.evidence.cost(fit.adjusted.errors).field[0])
         layout = stretch(fit) if self.purpose.picture else 1.0
         spread = (fit.tilt_spread or 0.0) / _TYPICAL_TILT_SPREAD
         wide = 4.0 * self.problem.count * math.log(max(spread, 1.0))
         priors = self.problem.adjuster_of(fit).camera_prior_cost(fit.adjusted.parameters)
-        score = self.lower_bound(fit.model, errors, fit.free_lens) + wide + priors
-        return Hypothesis(fit, score, float(errors.field[0]), layout)
+        score = self.lower_bound(fit.model, fit.adjusted.errors, fit.free_lens) + wide + priors
+        return Hypothesis(fit, score, field, layout)
 
-    def lower_bound(self, model: MotionModel, errors: ErrorCost, free_lens: BoolArray | None = None) -> float:
-        """The score of a model that leaves such errors, of a camera that is as cameras are."""
+    def lower_bound(self, model: MotionModel, errors: FloatArray, free_lens: BoolArray | None = None) -> float:
+        """The score of a model that leaves such errors (M, 2), of a camera that is as cameras are."""
         free = parameter_count(self.problem, model, self.problem.free_lens if free_lens is None else free_lens)
         preference = TWENTY_TO_ONE if model.on_sphere != (self.purpose is Purpose.PANO) else 0.0
-        return float((errors.cost + freedom_cost(free, errors.count))[0]) + preference
+        return float(self.evidence.cost(errors, free).cost[0]) + preference
 
     def suffices(self, best: Hypothesis, model: MotionModel) -> bool:
         """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""
-        if not model.one_camera and not _is_beyond_one_camera(self, best, float(self.floor.field[0])):
+        if not model.one_camera and not _is_beyond_one_camera(self, best, self.least_field):
             return True
-        return not best.implausible and best.score <= self.lower_bound(model, self.floor)
+        return not best.implausible and best.score <= self.lower_bound(model, self.link_errors)
 
 
 def select_model(
@@ -164,7 +164,7 @@ def select_model(
     planar = [model for model in models if not model.on_sphere]
     wide = replace(problem, free_lens=np.logical_or.reduce([problem.free_lens, *lenses]))
     turns = [_TurnTrial.of(posterior, wide, model) for model in models if model.on_sphere]
-    bar = posterior.lower_bound(planar[0], posterior.floor) if planar else math.inf
+    bar = posterior.lower_bound(planar[0], posterior.link_errors) if planar else math.inf
     early = [turn.scored(posterior) for turn in turns if turn.bound < bar]
     tried = _with_planar(posterior, early, planar, free=not all(model.one_camera for model in models))
     for turn in (turn for turn in turns if turn.bound >= bar):
@@ -188,7 +188,7 @@ class _TurnTrial:
         if len(problem.observations) == 1:  # a trial is the whole
             return cls(model, -math.inf, None)
         trial = fit_trial(problem, model)
-        bound = posterior.lower_bound(model, posterior.evidence.cost(fit_pairwise(problem, model, trial).errors))
+        bound = posterior.lower_bound(model, fit_pairwise(problem, model, trial).errors)
         return cls(model, bound, trial.parameters.shared)
 
     def scored(self, posterior: Posterior) -> Hypothesis:

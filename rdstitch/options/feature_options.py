@@ -8,17 +8,13 @@ from rdstitch.choices import FeatureName
 from rdstitch.errors import ArgumentError
 from rdstitch.options.option import Options, documented, option
 
-WORK_MEGAPIXELS = 0.6
-"""10⁶ pixels to which images of a large set are halved unless it is said otherwise."""
-MAX_FEATURES = 2000
-"""Keypoints kept per image of a large set unless it is said otherwise."""
-CLOSER = 4.0
-"""Times as many pixels are used where the working size shows too little."""
-
+WORK_MEGAPIXELS = 0.6  # 10⁶ pixels to which images of a large set are halved unless it is said otherwise
+MAX_FEATURES = 2000  # keypoints kept per image of a large set unless it is said otherwise
+CLOSER = 4.0  # times as many pixels are used where the working size shows too little
 _BUDGET = 8  # images of a large set whose pixels and keypoints fewer images may share among them
+# Times as many pixels, and keypoints, that an image of a small set gets at most: keypoints beyond the strongest 4,000
+# made λ of single pairs of a flight less certain, not more.
 _MAX_PIXELS, _MAX_FEATURES = 4.0, 2.0
-"""Times as many pixels, and keypoints, that an image of a small set gets at most: keypoints beyond the strongest 4,000
-made λ of single pairs of a flight less certain, not more."""
 
 
 @documented
@@ -65,12 +61,7 @@ class FeatureOptions(Options):
             object.__setattr__(self, "work_megapixels", None)
 
     def for_images(self, count: int) -> Self:
-        """The same with numbers for what was left open, which depend on how many images there are.
-
-        A pair takes a second anyway, and all that is known of its lens comes from its own keypoints; hundreds of
-        images have enough together. Fewer than eight images share what eight would have, up to four times as many
-        pixels and twice as many keypoints each.
-        """
+        """The same with numbers for what was left open: fewer than eight images share what eight would have."""
         share = max(_BUDGET / max(count, 1), 1.0)
         return replace(
             self,

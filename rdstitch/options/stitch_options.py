@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from rdstitch.geometry.camera import Camera
     from rdstitch.inputs.odometry import Odometry
 
+# Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them.
 _SELECT_MODEL_BELOW = 50
-"""Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them."""
 
 
 @documented

@@ -27,8 +27,7 @@ def align_registration_locally(
 ) -> LocalAlignment:
     """Displacement fields of the images that are used, in their order, from the matches of all their pairs.
 
-    The registration is in pixels of the images; ``edges`` are those of an image that fields should not bend, looked for
-    in so many images at a time.
+    ``edges`` are those of an image that fields should not bend.
     """
     if choice == "off":
         return no_local_alignment("switched off")

@@ -28,22 +28,15 @@ from rdstitch.system.cache import Cache
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.verification.limits import Limits
 
-_ROUNDS = 2
-"""Of registering more pairs and selecting inliers again at most, each by what the one before has shown."""
-
-_SETTLED = 0.05
-"""Share of the inliers that must have changed for the images to be aligned again."""
-
+_ROUNDS = 2  # of registering more pairs and selecting inliers again at most, each by what the one before has shown
+_SETTLED = 0.05  # share of the inliers that must have changed for the images to be aligned again
+# Share of the matches off the planes of their pairs that are where the alignment expects them: more than half, and it
+# was the lens that moved them, not the ground.
 _EXPLAINED = 0.5
-"""Share of the matches off the planes of their pairs that are where the alignment expects them: more than half, and it
-was the lens that moved them, not the ground."""
-
-
+# Up to how many standard deviations a match is an inlier, but at least up to so many pixels.
 _WIDTH_PER_SIGMA, _MIN_THRESHOLD = 4.0, 0.5
-"""Up to how many standard deviations a match is an inlier, but at least up to so many pixels."""
-
+# Share of its inliers that a pair must keep; otherwise the alignment does not fit it, and it stays as it is.
 _MIN_KEPT = 0.5
-"""Share of its inliers that a pair must keep; otherwise the alignment does not fit it, and it stays as it is."""
 
 
 @contextmanager
@@ -136,9 +129,8 @@ class Aligner:
     def _explains(
         self, alignment: Alignment, pairs: Sequence[PairRegistration], ground: Sequence[PairRegistration]
     ) -> bool:
-        """Whether most matches that pairs on their own do not explain are where an alignment without them expects them.
-
-        It knows more of the lens than a pair does; and near a camera that turns is no ground.
+        """Whether most matches off the planes of their pairs are where an alignment without them expects them: it knows
+        more of the lens than a pair does; and near a camera that turns is no ground.
         """
         errors = [np.zeros(0)]
         for pair, more in zip(pairs, ground, strict=True):
@@ -239,10 +231,9 @@ def select_by_whole_lens(aligned: AlignedPairs, threshold: float) -> list[PairRe
 def reselect_inliers(
     pairs: Sequence[PairRegistration], alignment: Alignment, threshold: float
 ) -> dict[int, PairRegistration]:
-    """Select the inliers of the pairs again, by what an alignment expects of their putative matches.
+    """Select the inliers again of the pairs that an alignment uses and fits, by their position in ``pairs``.
 
-    An inlier is within ``threshold``, pixels, or less where the inliers scatter less. Given are the pairs that the
-    alignment uses and fits, by their position in ``pairs``.
+    An inlier is within ``threshold``, pixels, of where it is expected, or less where the inliers scatter less.
     """
     errors = {k: pair.errors(alignment.transfer) for k, pair in enumerate(pairs) if pair.images in alignment.support}
     known = [errors[k][pairs[k].relation.inliers] for k in errors]

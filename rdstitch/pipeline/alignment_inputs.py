@@ -18,10 +18,7 @@ from rdstitch.system.file_access import canonical_name
 
 
 def alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:
-    """What is decided or known beforehand of images as the camera stored them.
-
-    Measured attitudes that are not exact leave the mount's tilt open.
-    """
+    """What is known of images as the camera stored them; attitudes that are not exact leave the mount's tilt open."""
     stored = QuarterTurns.of(sources).back
     measured = [source.attitude for source in sources if source.attitude is not None]
     attitudes = [attitude.tilt for attitude in measured]

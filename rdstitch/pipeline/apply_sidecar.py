@@ -19,10 +19,9 @@ from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.option import declared, with_fields
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.compose import CanvasPlan, compose_images
-from rdstitch.pipeline.deep_zoom_page import plainly_viewed, write_page
 from rdstitch.pipeline.replacements import read_replacements
 from rdstitch.pipeline.run import Run
-from rdstitch.pipeline.run_files import RunFiles, check_world_files
+from rdstitch.pipeline.run_files import RunFiles, check_world_files, plainly_viewed, write_page
 from rdstitch.pipeline.straighten import reoriented
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages, SavedGrid
@@ -137,11 +136,7 @@ def apply_found(
         return result
     page = partial(plainly_viewed, result.canvas, [source.name for source in sources.values()])
     result = replace(result, messages=(*result.messages, *write_page(result, outputs, page)))
-    homographies = list(plan.placed.homographies)
-    record = applied_sidecar(
-        saved, result, sources, homographies, given.left_out, given.matched, same_lens=lens is None
-    )
-    outputs.write(f"{output}.json", json_bytes(record))
+    outputs.write(f"{output}.json", json_bytes(applied_sidecar(result, same_lens=lens is None)))
     return result
 
 

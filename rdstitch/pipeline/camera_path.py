@@ -33,9 +33,8 @@ def with_odometry_of_bag(inputs: Iterable[Named], options: StitchOptions) -> Sti
 def camera_path(
     registration: Registration, odometry: Odometry | str | Path | None, height: float | None
 ) -> tuple[Trajectory, list[Message]]:
-    """The path with names, numbers and times of the images; and what odometry, if it was given, has shown of it.
-
-    ``height`` of the first image over the plane, in the unit of the path, where that is not one or the odometry's.
+    """The path with names, numbers and times of the images, in ``height`` of the first one or the unit of the odometry;
+    and what that has shown of it.
     """
     sources, messages = registration.sources, list[Message]()
     # Of the camera itself, whatever EXIF says of how its images are looked at.

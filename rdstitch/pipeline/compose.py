@@ -78,11 +78,10 @@ class CanvasPlan:
 def compose_images(
     plan: CanvasPlan, run: Run, outputs: Outputs, run_blocks: BlockRunner | None = None
 ) -> tuple[OutputImage, list[Message]]:
-    """See whether a file can hold the canvas, and put the images on it; of a dry run the plan alone.
+    """Put images on a canvas, in memory or into a file that can hold it, of a dry run plan it; and what to know of it.
 
-    Without an output the image is made in memory; a file has colour profile and EXIF of the first image, and its place
-    on the Earth. ``run_blocks``: see :func:`rdstitch.compositing.compose_decided`. With it comes what the user should
-    know, such as why nothing was cropped.
+    A file has colour profile and EXIF of the first image, and its place on the Earth. ``run_blocks``: see
+    :func:`rdstitch.compositing.compose_decided`.
     """
     return_freed_memory()
     options = run.options.compositing

@@ -27,11 +27,10 @@ from rdstitch.system.cache import Cache
 from rdstitch.system.process_memory import reuse_freed_memory
 
 _IMAGES_AT_ONCE, _MIN_BATCHES = 8, 16  # images of a task at the most; tasks at the least
+# Features per 10⁶ pixels that images of usual contrast show at least; flights show 10,000 to 15,000.
 _USUAL_DENSITY = 2000
-"""Features per 10⁶ pixels that images of usual contrast show at least; flights show 10,000 to 15,000."""
-
+# Of those, or of the features wanted if these are fewer: where half of the images show less, contrast is low.
 _LOW_SHARE = 0.5
-"""Of those, or of the features wanted if these are fewer: where half of the images show less, contrast is low."""
 
 
 @dataclass(frozen=True)
@@ -107,10 +106,7 @@ def _no_features(options: FeatureOptions, source: Source) -> Features:
 def detect_by_contrast(
     sources: Sequence[Source], options: FeatureOptions, run: Run, executor: Executor, store: Cache
 ) -> DetectedFeatures:
-    """Detect the features of all images, if necessary once more.
-
-    They lie in ``store``; damaged images are reported, but of a panorama raised.
-    """
+    """Detect the features of all images into ``store``, if necessary once more; damaged images of a panorama raise."""
     detect = partial(_detect_all, run=run, executor=executor, store=store)
     of_one = partial(_stretch_of_one, megapixels=options.limits[1], store=store)
 
@@ -141,8 +137,7 @@ def detect_by_contrast(
 def _of_low_contrast(sources: Sequence[Source], detected: DetectedFeatures, options: FeatureOptions) -> list[int]:
     """The images that show few features for their size, or for what the set shows, for want of contrast.
 
-    Counted are those of the working size: that there are more pixels, in which more is found, is no contrast. A board
-    of black and white squares shows few, but strong ones; equalization would only add the noise of what is plain.
+    A board of black and white squares shows few, but strong ones; equalization would only add noise.
     """
     most, megapixels = options.limits
     counts, poor = np.minimum(_counts_of(detected.features.items), most), []

@@ -228,9 +228,8 @@ def _dry_run(
 
 
 def _sharpness_and_exposure(image: DecodedImage) -> tuple[float, float, float]:
-    """Sharpness, mean brightness from 0 to 1, and share of burnt-out pixels of an image.
-
-    Sharpness is the contrast of the finest detail over that of twice as coarse detail; an image without detail has 0.
+    """Contrast of the finest detail over that of twice as coarse detail, 0 without any; mean brightness, 0 to 1; and
+    share of burnt-out pixels.
     """
     samples = image.pixels
     whole = samples.dtype.kind == "u"

@@ -47,14 +47,11 @@ def follow(
     preview: Path | None = None,
     refresh: float = 5.0,
 ) -> Generator[Pose]:
-    """Register frames as they arrive, against the last keyframes.
+    """Register frames as they arrive: a pose for each, and more for those that find their place, or another one, later.
 
-    Poses are for watching: loops are closed, and every pair is used, only when all frames are registered together
-    afterwards, by :func:`rdstitch.mosaic` or :func:`rdstitch.trajectory`. Features are fewer and from smaller images
-    than there. Memory does not grow with the number of frames. ``comes_again`` says of a frame that could not be read
-    whole whether it will come again (:class:`rdstitch.inputs.frame_stream.FrameStream`); ``preview`` is written every
-    ``refresh`` seconds at most. One pose a frame, and more for those that find their
-    place, or another one, only later.
+    Features are fewer than in a recipe, loops are not closed, and memory does not grow with the number of frames.
+    ``comes_again`` says whether a frame that could not be read whole will come again; ``preview`` is written every
+    ``refresh`` seconds at most.
     """
     tracker = Tracker(options, poses, patient=True)
     live_preview = None if preview is None else LivePreview(preview, refresh)

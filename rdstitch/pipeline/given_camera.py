@@ -17,10 +17,7 @@ from rdstitch.results.messages import Message
 
 
 def read_camera(file: str | Path, inputs: Sequence[Named] = ()) -> tuple[Camera, list[Message]]:
-    """The camera of a file or bag, and, where λ is fitted to another lens model, how well it describes that.
-
-    Some files do not say the size of the images, which is then that of ``inputs``.
-    """
+    """The camera of a file, without a size that of ``inputs``, or bag; where λ is fitted to another model, how well."""
     if is_bag(Path(file)):
         return camera_in(file), []
     from rdstitch.camera_files import read_camera_file  # with all formats, which most runs have no use for

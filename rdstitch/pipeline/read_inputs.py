@@ -27,10 +27,7 @@ NO_FLAT_FIELD = Message(
 
 
 def in_order(frames: Sequence[Frame]) -> Sequence[Frame]:
-    """Files by their names where every pair is compared, so that the order in which they were named does not show.
-
-    Of more images, and of arrays, the order says which follow which.
-    """
+    """Files by their names where every pair is compared; of more images, and of arrays, the order tells neighbours."""
     if len(frames) > EXHAUSTIVE_UP_TO or any(frame.image is not None for frame in frames):
         return frames
     return sorted(frames, key=lambda frame: (natural_key(frame.path), frame.number or 0))

@@ -26,14 +26,20 @@ from rdstitch.pipeline.accept import accept, scale_uncertainty
 from rdstitch.pipeline.camera_path import camera_path
 from rdstitch.pipeline.choose_layout import choose_layout
 from rdstitch.pipeline.compose import compose_images
-from rdstitch.pipeline.deep_zoom_page import viewed_images, write_page
 from rdstitch.pipeline.lay_out import CandidateLayout
 from rdstitch.pipeline.map_canvas import check_map
 from rdstitch.pipeline.read_inputs import in_order, read_inputs
 from rdstitch.pipeline.realign import aligner_of, with_reference_of
 from rdstitch.pipeline.register import register
 from rdstitch.pipeline.run import Run, started
-from rdstitch.pipeline.run_files import RunFiles, check_world_files, report_refused, stage_beside
+from rdstitch.pipeline.run_files import (
+    RunFiles,
+    check_world_files,
+    report_refused,
+    stage_beside,
+    viewed_images,
+    write_page,
+)
 from rdstitch.pipeline.run_on_sources import blocks_on
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason
@@ -280,9 +286,7 @@ def _registered(listed: FoundImages, run: Run) -> Registration:
 
 @contextmanager
 def _failures_explained(run: Run, known: Sequence[Message]) -> Iterator[None]:
-    """A registration that fails in the block names what could not be read well; of one that is refused the report is
-    written.
-    """
+    """Failures of the block name what could not be read well; of a result that is refused the report is written."""
     try:
         yield
     except RegistrationError as error:
@@ -297,10 +301,9 @@ def _failures_explained(run: Run, known: Sequence[Message]) -> Iterator[None]:
 def _accepted(
     sources: Sequence[Source], known: Sequence[Message], run: Run, executor: Executor
 ) -> tuple[Registration, Run]:
-    """Register and check, with what is known of the inputs already.
+    """Register and check, in pixels of the working size.
 
-    In pixels of the working size. Where the first image shall be the reference, but was left out, the first that is
-    used becomes it: the run says so then.
+    Where the first image shall be the reference, but was left out, the first that is used is, and the run says so.
     """
     registration = register(sources, run, executor).with_messages(known)
     run.progress("checking", 0, 1)

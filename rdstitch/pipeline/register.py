@@ -21,9 +21,8 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner, draft_with_loops, impossible_estimates_fail
 from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.image_circle import with_image_circle
-from rdstitch.pipeline.match_crossings import match_crossings
+from rdstitch.pipeline.repeated_patterns import match_crossings, settle_repeated_pattern
 from rdstitch.pipeline.run import Run
-from rdstitch.pipeline.settle_repeated_pattern import settle_repeated_pattern
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.results.registration import Registration
@@ -39,11 +38,10 @@ _STATIC_BACKGROUND = Message(
 
 @impossible_estimates_fail()
 def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registration:
-    """Detect features, register pairs, and align all images as one.
+    """Detect features, register pairs, and align all images, of two lenses those of one, in pixels of the working size.
 
     Once there are poses, images that these put beside each other are tried too (loop closures), and every pair of an
-    image that found no place. Where the images come from two lenses, those of one are aligned. All pixels in the
-    result are those of the size that features are detected at, see :mod:`rdstitch.pipeline.working_size`.
+    image that found no place.
     """
     options, purpose, progress = run.options.for_images(len(sources)), run.purpose, run.progress
     cache = Cache.at(options.cache)
@@ -96,8 +94,8 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
 def with_frontal_reference(registration: Registration, options: StitchOptions, *, always: bool) -> Registration:
     """The same registration with an undistorted image as its plane; directions of a turn on the spot stay.
 
-    That is the reference image, unless another one crosses its horizon and nobody named it: then one that, if possible,
-    no image crosses the horizon of. With ``always`` a rectified plane, that of one camera's poses, gives way too.
+    That is the reference image, unless it was chosen here and another one crosses its horizon. With ``always`` a
+    rectified plane, that of one camera's poses, gives way too.
     """
     alignment = registration.alignment
     if alignment.on_sphere or (not always and alignment.poses is not None):

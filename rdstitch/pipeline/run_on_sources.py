@@ -36,10 +36,7 @@ def _result_and_state(task: SourceTask[Result]) -> tuple[Result, GuardState]:
 def blocks_on(
     executor: Executor, sources: Sequence[Source], guard: InputGuard, folder: Path | None
 ) -> BlockRunner | None:
-    """What computes blocks of an output on the workers of an executor; None for threads, which need no blocks.
-
-    ``folder`` is what all machines see by the same name, for the strips; None where there is one machine.
-    """
+    """What computes blocks of an output on workers, with strips in ``folder``; None for threads: they need none."""
     if isinstance(executor, ThreadPoolExecutor):
         return None
 

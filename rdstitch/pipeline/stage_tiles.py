@@ -87,9 +87,9 @@ def tiles(
         found_images(as_tiles(inputs), outputs=[run.output], topic=options.topic) as listed,
         Outputs(options.overwrite) as outputs,
     ):
-        registration, tiled = _registered(listed, run, options, positions_file, outputs)
+        registration = _registered(listed, run, options, positions_file, outputs)
         with run.executor(len(registration.sources)) as executor:
-            _write_beside(outputs, positions_file, options, registration, tiled)
+            _write_beside(outputs, positions_file, options, registration)
             chosen = lay_out(registration, no_local_alignment("tiles on a stage"), options.composite)
             chosen = replace(chosen, plan=replace(chosen.plan, photographs=False))
             return compose_registration(chosen, run, outputs, executor)
@@ -132,14 +132,15 @@ def place_tiles(
         found_images(as_tiles(inputs), topic=options.topic) as listed,
         Outputs(options.overwrite) as outputs,
     ):
-        registration, tiled = _registered(listed, run, options, positions_file, outputs)
-        _write_beside(outputs, positions_file, options, registration, tiled)
-    return tiled, registration
+        registration = _registered(listed, run, options, positions_file, outputs)
+        _write_beside(outputs, positions_file, options, registration)
+    assert registration.tiles is not None
+    return registration.tiles, registration
 
 
 def _registered(
     listed: FoundImages, run: Run, options: TileOptions, positions_file: str | Path | None, outputs: Outputs
-) -> tuple[Registration, TileRegistration]:
+) -> Registration:
     """The places of all tiles, once it is clear that everything can be written."""
     tables = [Path(file) for file in (positions_file, options.save_flat_field) if file is not None]
     names = [frame.name for frame in listed.frames]
@@ -163,7 +164,7 @@ def _registered(
                 raise
             unread += damaged
     tiled = replace(tiled, z=options.z, time=options.time)
-    return tiles_as_registration(sources, tiled).with_messages([*unread, *listed.messages, *notes, *messages]), tiled
+    return tiles_as_registration(sources, tiled).with_messages([*unread, *listed.messages, *notes, *messages])
 
 
 def _of_one_kind(sources: list[Source], strict: bool) -> tuple[list[Source], list[Message]]:
@@ -235,11 +236,10 @@ def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
     return agrees_with_overlaps(field, compared)
 
 
-def _write_beside(
-    outputs: Outputs, file: str | Path | None, options: TileOptions, registration: Registration, tiled: TileRegistration
-) -> None:
+def _write_beside(outputs: Outputs, file: str | Path | None, options: TileOptions, registration: Registration) -> None:
     """The table of places, and the flat field, where they are wanted."""
-    if options.dry_run:
+    tiled = registration.tiles
+    if options.dry_run or tiled is None:
         return
     if file is not None:
         names = [source.name for source in registration.sources]

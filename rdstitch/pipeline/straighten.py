@@ -3,6 +3,7 @@
 import math
 from contextlib import suppress
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 
@@ -52,16 +53,11 @@ def oriented(placed: PlacedImages, options: CompositeOptions) -> tuple[PlacedIma
         raise ArgumentError(
             "yaw, pitch and roll are for images taken by turning on the spot; these were not, use --rotate"
         )
-    if (matrix := _product(view, upright)) is None:
+    turns = [turn for turn in (view, upright) if turn is not None]
+    if not turns:
         return placed, messages
+    matrix: FloatArray = reduce(np.matmul, turns)
     return replace(placed, homographies=matrix @ placed.homographies, orientation=matrix), messages
-
-
-def _product(first: FloatArray | None, second: FloatArray | None) -> FloatArray | None:
-    """The product of those of two matrices (3, 3) that there are."""
-    if first is None or second is None:
-        return second if first is None else first
-    return np.asarray(first @ second)
 
 
 def reoriented(

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypedDict, Unpack, get_args, overload
+from typing import Any, TypedDict, Unpack, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.write import write_image
-from rdstitch.options.option import files_in
+from rdstitch.options.option import check_parameter, files_in
 from rdstitch.pipeline.given_camera import read_camera
 from rdstitch.results.messages import Message, ignored
 from rdstitch.system.native_threads import one_native_thread
@@ -96,10 +96,8 @@ def undistort(
     """
     if (camera is None) == (distortion is None):
         raise ArgumentError("give either a camera or a distortion")
-    if view not in get_args(Framing):
-        raise ArgumentError(f"unknown view {view!r}; choose same, all or valid")
-    if image_format is not None and image_format not in get_args(ImageFormat):
-        raise ArgumentError(f"unknown format {image_format!r}; choose {', '.join(get_args(ImageFormat))}")
+    check_parameter("view", Framing, view)
+    check_parameter("image_format", ImageFormat | None, image_format)
     given = as_inputs(inputs, channel_order)
     file = camera if isinstance(camera, str | Path) else None
     lens, notes = read_camera(camera, given) if isinstance(camera, str | Path) else (camera, [])

@@ -10,7 +10,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.matching.match_graph import spanning_tree
 from rdstitch.results.registration import Registration
 from rdstitch.robust.loss import RAYLEIGH_MEDIAN
-from rdstitch.robust.posterior import Evidence, freedom_cost
+from rdstitch.robust.posterior import Evidence
 
 _RESOLVED = 0.1
 """Standard deviation of the shift of a pair, pixels, up to which its matches can say that it is whole."""
@@ -102,6 +102,5 @@ def _whole_shifts(registration: Registration) -> FloatArray | None:
         np.array([alignment.cameras[alignment.reference].scale]),
         np.array([min(1.0, (len(places) - 1) / len(left))]),
     )
-    by_model = evidence.cost(fitted)
-    freedom = freedom_cost(_FREEDOM * (len(places) - 1), by_model.count)
-    return places if evidence.cost(whole).cost[0] <= (by_model.cost + freedom)[0] else None
+    by_model = evidence.cost(fitted, _FREEDOM * (len(places) - 1))
+    return places if evidence.cost(whole).cost[0] <= by_model.cost[0] else None

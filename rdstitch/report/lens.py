@@ -6,7 +6,7 @@ from rdstitch.alignment.lens.lens_description import describe_lens, radius_std
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.distortion_consensus import Consensus, vote
-from rdstitch.report.pairs import pairs_of, residuals
+from rdstitch.report.pairs import residuals
 from rdstitch.report.svg import BLUE, RED, Markup, counted, drawing, element, label, line, polyline, section
 from rdstitch.results.registration import Registration
 
@@ -42,13 +42,9 @@ def lens_curve(registration: Registration) -> str:
 
 def _places(registration: Registration) -> FloatArray:
     """Give where the matches that agree with the alignment are, pixels of images of the reference's size, (N, 2)."""
-    alignment, camera = registration.alignment, registration.upright_camera
-    places, pairs = [np.empty((0, 2))], pairs_of(registration)
-    for fit in alignment.links:
-        if fit.used and fit.rms > 0.0:
-            other = alignment.cameras[fit.image2]
-            places.append(camera.denormalize(other.normalize(residuals(registration, pairs, fit)[0])))
-    return np.concatenate(places)
+    camera = registration.upright_camera
+    places = [camera.denormalize(other.normalize(measured)) for other, measured, _ in residuals(registration)]
+    return np.concatenate([np.empty((0, 2)), *places])
 
 
 def _support(camera: Camera, places: FloatArray, farthest: float) -> str:

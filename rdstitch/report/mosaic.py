@@ -56,9 +56,7 @@ def mosaic_section(result: StitchResult, staged: Path | None = None) -> str:
 
 
 def seam_dots(seams: SeamQuality, scale: float, apart: float) -> list[tuple[float, float, bool]]:
-    """Places along seams, in pixels of a drawing, and whether they are broken: one in each cell of a side ``apart``, a
-    broken one where there is any.
-    """
+    """Places along seams, pixels of a drawing, and whether broken: one in each cell of a side ``apart``."""
     at = (seams.places + 0.5) * scale
     order = np.argsort(~seams.broken, kind="stable")
     _, first = np.unique((at[order] // apart).astype(np.int64), axis=0, return_index=True)

@@ -122,7 +122,7 @@ def summary(result: StitchResult | Registration) -> str:
         failures = "; ".join(message.clause for message in registration.failures)
         verdict = element("p", f"Not to be relied on: {failures}", class_="bad")
     rows = [
-        ("λ (half diagonal)", _lambda(registration)),
+        ("λ (half diagonal)", registration.distortion_in_words(6)),
         ("λ per px²", f"{camera.distortion_px:.4e}"),
         ("images", f"{int(alignment.used.sum())} of {len(alignment.used) + unread}"),
         ("pairs", f"{sum(fit.used for fit in alignment.links)} used of {len(registration.pairs)} compared"),
@@ -143,9 +143,7 @@ def summary(result: StitchResult | Registration) -> str:
 
 def notices(registration: Registration) -> str:
     """Warnings, and images that were left out, each with the reason."""
-    texts = [
-        message.clause for severity in ("warning", "note") for message in of_severity(registration.messages, severity)
-    ]
+    texts = [message.clause for message in (*registration.warnings, *of_severity(registration.messages, "note"))]
     listed = element("p", "No warnings.")
     if texts:
         listed = joined(element("h3", "What to look at"), element("ul", (element("li", item) for item in texts)))
@@ -166,16 +164,6 @@ def _left_out(registration: Registration) -> str:
     others = merge_by_reason(registration.left_out[_MAX_THUMBNAILS:])
     more = element("p", f"And without a picture: {'; '.join(map(str, others))}.") if others else ""
     return joined(element("h3", "Left out"), element("div", shown, class_="thumbnails"), more)
-
-
-def _lambda(registration: Registration) -> str:
-    alignment = registration.alignment
-    if not alignment.lens_observable:
-        return "not observable"
-    given = alignment.lens_given
-    return f"{alignment.distortion:.6f} " + (
-        f"({alignment.lens_reason})" if given else f"± {alignment.distortion_std:.6f}"
-    )
 
 
 def run_section(stages: Sequence[tuple[str, float]], command: str) -> str:

@@ -1,6 +1,5 @@
 """The pairs: over the outlines of the images, the best and the worst one, and what the model leaves over."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -8,8 +7,8 @@ import numpy as np
 from rdstitch.alignment.result import LinkFit
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.compositing.projection import PROJECTIONS
+from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import to_directions, to_plane
-from rdstitch.matching.two_view import PairRegistration
 from rdstitch.report.svg import (
     BLUE,
     GREEN,
@@ -59,9 +58,9 @@ def match_graph(registration: Registration) -> str:
     by_error = sorted(links, key=lambda fit: fit.rms)
     for fit in (by_error[k] for k in evenly_spaced(len(links), _MAX_LINKS)):
         share = float(np.nan_to_num(np.clip(fit.rms / alignment.rms - 0.75, 0.0, 1.0)))
-        names = " and ".join(registration.sources[k].name for k in (fit.image1, fit.image2))
+        names = " and ".join(registration.sources[k].name for k in fit.images)
         title = element("title", f"{names}: {fit.inliers} of {fit.count} matches, {fit.rms:.2f} pixels")
-        start, end = ((centers[k] + shift) * scale for k in (fit.image1, fit.image2))
+        start, end = ((centers[k] + shift) * scale for k in fit.images)
         thickness = float(np.clip(np.log10(fit.inliers + 1.0), 0.5, 4.0))
         parts.append(line(start, end, title, stroke=_mixed(share), stroke_width=thickness))
     for index, center in centers.items():
@@ -103,9 +102,9 @@ def matched(registration: Registration) -> str:
 
 
 def _pair(registration: Registration, title: str, fit: LinkFit) -> str:
-    pair = pairs_of(registration)[fit.image1, fit.image2]
-    sources = [registration.sources[k] for k in (fit.image1, fit.image2)]
-    sizes = [registration.alignment.cameras[k].image_size for k in (fit.image1, fit.image2)]
+    pair = next(pair for pair in registration.pairs if pair.images == fit.images)
+    sources = [registration.sources[k] for k in fit.images]
+    sizes = [registration.alignment.cameras[k].image_size for k in fit.images]
     scales = [_IMAGE_WIDTH / width for width, _ in sizes]
     lefts = [0.0, _IMAGE_WIDTH + _IMAGE_GAP]
     parts = []
@@ -142,15 +141,12 @@ def _match_lines(starts: FloatArray, stops: FloatArray, colour: str, opacity: fl
 
 def residual_map(registration: Registration) -> str:
     """Errors of all pairs over the area of the image: rms as grey, mean as an arrow."""
-    alignment = registration.alignment
-    pairs = pairs_of(registration)
-    errors = [residuals(registration, pairs, fit) for fit in alignment.links if fit.used and fit.rms > 0.0]
-    cameras = [alignment.cameras[fit.image2] for fit in alignment.links if fit.used and fit.rms > 0.0]
+    errors = residuals(registration)
     if not errors:
         return section("Residuals", "There are none.")
     # Images of several sizes are laid over one another.
-    places = np.concatenate([(p + 0.5) / camera.image_size for (p, _), camera in zip(errors, cameras, strict=True)])
-    off = np.concatenate([residual for _, residual in errors])
+    places = np.concatenate([(measured + 0.5) / camera.image_size for camera, measured, _ in errors])
+    off = np.concatenate([residual for *_, residual in errors])
     width, height = registration.upright_camera.image_size
     rows = max(1, round(_COLUMNS * height / width))
     cell = np.clip((places * (_COLUMNS, rows)).astype(int), 0, (_COLUMNS - 1, rows - 1)) @ (1, _COLUMNS)
@@ -202,25 +198,21 @@ def image_centre(registration: Registration, index: int) -> FloatArray:
     return _on_plane(registration, index, np.array([[(width - 1) / 2, (height - 1) / 2]])).reshape(2)
 
 
-def pairs_of(registration: Registration) -> dict[tuple[int, int], PairRegistration]:
-    """The pairs by their images."""
-    return {(pair.image1, pair.image2): pair for pair in registration.pairs}
-
-
-def residuals(
-    registration: Registration, pairs: Mapping[tuple[int, int], PairRegistration], fit: LinkFit
-) -> tuple[FloatArray, FloatArray]:
-    """Give where the matches of a link are in the second image, and how far from there the alignment puts them, pixels.
-
-    Matches that the pair itself takes for wrong are left out, and those that miss by more than four times the link's
-    error.
+def residuals(registration: Registration) -> list[tuple[Camera, FloatArray, FloatArray]]:
+    """Of each link the camera of its second image, where the inliers are in it, and how far the alignment puts them
+    from there, pixels; without those that miss by more than four times the link's error.
     """
-    pair = pairs[fit.image1, fit.image2]
-    inliers = pair.relation.inliers
-    given, measured = pair.correspondences.points1[inliers], pair.correspondences.points2[inliers]
-    off = registration.alignment.transfer(fit.image1, fit.image2, given) - measured
-    kept = np.linalg.norm(off, axis=1) <= 4.0 * fit.rms
-    return measured[kept], off[kept]
+    alignment, pairs = registration.alignment, {pair.images: pair for pair in registration.pairs}
+    found = []
+    for fit in alignment.links:
+        if fit.used and fit.rms > 0.0:
+            pair = pairs[fit.images]
+            inliers = pair.relation.inliers
+            given, measured = pair.correspondences.points1[inliers], pair.correspondences.points2[inliers]
+            off = alignment.transfer(*fit.images, given) - measured
+            kept = np.linalg.norm(off, axis=1) <= 4.0 * fit.rms
+            found.append((alignment.cameras[fit.image2], measured[kept], off[kept]))
+    return found
 
 
 def _on_plane(registration: Registration, index: int, points: FloatArray) -> FloatArray:

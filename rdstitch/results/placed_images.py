@@ -25,8 +25,8 @@ from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction
 from rdstitch.results.registration import Registration
 
+# Images, and pixels of their longer side, that are compared to find what is static in them.
 _STATIC_SAMPLE, _STATIC_SIDE = 8, 400
-"""Images, and pixels of their longer side, that are compared to find what is static in them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +80,7 @@ class PlacedImages:
 
     @cached_property
     def static(self) -> NDArray[np.bool_] | None:
-        """What shows no plane but the camera's own parts, or nothing, in all images; None where nothing does.
-
-        A few images of the commonest size are compared, reduced; those of other sizes count as a whole.
-        """
+        """What shows the camera's parts, or nothing, in a few images of the commonest size; None where none does."""
         size, count = Counter(camera.image_size for camera in self.cameras).most_common(1)[0]
         if self.whole or count < MIN_IMAGES:
             return None

@@ -1,6 +1,5 @@
 """What registering a set of images gives."""
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
@@ -107,12 +106,15 @@ class Registration:
             linked = int(self.tiles.linked.sum())
             alone = f", {used - linked} by the stage alone" if linked < used else ""
             images = f"{linked} of {used + len(self.left_out)} images registered{alone}"
-        distortion, deviation = self.alignment.distortion, self.alignment.distortion_std
-        if not math.isfinite(deviation):
-            return f"{images}, λ not observable"
-        return f"{images}, λ = {distortion:.4f} " + (
-            f"({self.alignment.lens_reason})" if deviation == 0.0 else f"± {deviation:.4f}"
-        )
+        return f"{images}, λ {'= ' if self.alignment.lens_observable else ''}{self.distortion_in_words(4)}"
+
+    def distortion_in_words(self, digits: int) -> str:
+        """λ, to so many digits, with its standard deviation or why it has none."""
+        alignment = self.alignment
+        if not alignment.lens_observable:
+            return "not observable"
+        error = f"({alignment.lens_reason})" if alignment.lens_given else f"± {alignment.distortion_std:.{digits}f}"
+        return f"{alignment.distortion:.{digits}f} {error}"
 
     @property
     def upright_camera(self) -> Camera:

@@ -9,8 +9,8 @@ Errors are noise of the keypoints, and parts that neighbours share: depth, relie
 points of a part of an overlap together. The errors ``e`` of a link are therefore taken as ``noise + field``, the field
 being piecewise constant on two grids over the overlap: blocks of a quarter of it, and cells of a sixteenth. The noise
 belongs to the keypoints; how large the two parts of the field are belongs to the hypothesis, and is what makes its
-errors most likely. Where the field is larger than the noise, a cell is one observation, however many matches it has: a
-freer model does not win by fitting relief a little better.
+score best, the cost of freedom included. Where the field is larger than the noise, a cell is one observation, however
+many matches it has: a freer model does not win by fitting relief a little better.
 
 Up to constants, with ``m_c`` the mean error of a cell of ``n_c`` matches, ``v_c = τ₂² + σ²/n_c``, and ``M_b`` and
 ``1/W_b`` the mean and variance of a block by its cells,
@@ -164,7 +164,7 @@ def overlap_cells(link: IntArray, points: FloatArray, count: int, side: int) -> 
 class ErrorCost:
     """What the errors of G problems say of a hypothesis, each array (G,)."""
 
-    cost: FloatArray  # -2 log of their likelihood, up to a constant of the problem
+    cost: FloatArray  # -2 log of their likelihood, up to a constant of the problem, with what parameters cost
     field: FloatArray  # size of what neighbours share, pixels of a coordinate
     # independent coordinates: all where there is noise only, a pair of them a cell or block where the field is large
     count: FloatArray
@@ -210,8 +210,8 @@ class Evidence:
             np.ones(len(noise)) if weight is None else weight,
         )
 
-    def cost(self, errors: FloatArray) -> ErrorCost:
-        """How likely errors (M, 2), pixels, are with the fields that make them most likely."""
+    def cost(self, errors: FloatArray, parameters: int = 0) -> ErrorCost:
+        """How likely errors (M, 2), pixels, are that so many parameters leave, with the fields that are likeliest."""
         group, groups = self.group[self.block], len(self.noise)
         length, farthest = np.linalg.norm(errors, axis=1), self.farthest[group[self.cell]]
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -221,40 +221,31 @@ class Evidence:
         mean = sums / self.counts[:, None]
         squared = np.einsum("ck,ck->c", mean, mean)
         sizes = np.geomspace(MODEL_ERROR, np.maximum(self.farthest, 2.0 * MODEL_ERROR), _SIZES)
-        coarse = np.concatenate([np.zeros((1, groups)), sizes])[:, self.group]
-        best = ErrorCost(np.full(groups, np.inf), np.zeros(groups), np.full(groups, 2.0))
-        every = np.arange(groups)
+        coarse = np.concatenate([np.zeros((1, groups)), sizes])
+        tried = list[tuple[FloatArray, FloatArray, FloatArray]]()
         for fine in sizes:
             # A cell's mean error has the variance of its noise and of its own field; blocks of cells share another one.
             variance = (fine**2)[group] + (self.noise**2)[group] / self.counts
             information = np.bincount(self.block, 1.0 / variance)
             weighted = np.stack([np.bincount(self.block, axis / variance) for axis in mean.T], axis=1)
             power = np.einsum("bk,bk->b", weighted, weighted)
-            grown = 1.0 + information * coarse**2
-            of_blocks = 2.0 * np.log(grown) - coarse**2 * power / grown
-            costs = np.stack([np.bincount(self.group, each, groups) for each in of_blocks])
-            index = np.argmin(costs, axis=0)
-            of_cells = np.bincount(group, 2.0 * np.log(variance) + squared / variance, groups)
+            shared = coarse[:, self.group] ** 2
+            grown = 1.0 + information * shared
+            of_blocks = 2.0 * np.log(grown) - shared * power / grown
             # Of normal variables: log det Σ + r' Σ⁻¹ r, by cells with the blocks' fields taken out (Woodbury).
-            cost = self.weight * (of_cells + costs[index, every])
-            field = np.hypot(fine, np.concatenate([np.zeros((1, groups)), sizes])[index, every])
+            of_cells = np.bincount(group, 2.0 * np.log(variance) + squared / variance, groups)
+            fields = np.hypot(fine, coarse)
             # Independent coordinates: the information that is left, in units of what one coordinate would have.
-            left = information / np.take_along_axis(grown, index[self.group][None], axis=0)[0]
-            count = 2.0 * self.weight * (field**2 + self.noise**2) * np.bincount(self.group, left, groups)
-            better = cost < best.cost
-            best = ErrorCost(
-                np.where(better, cost, best.cost),
-                np.where(better, field, best.field),
-                np.where(better, np.maximum(count, 2.0), best.count),
-            )
-        return best
+            left = np.stack([np.bincount(self.group, each, groups) for each in information / grown])
+            counts = np.maximum(2.0 * self.weight * (fields**2 + self.noise**2) * left, 2.0)
+            costs = np.stack([np.bincount(self.group, each, groups) for each in of_blocks])
+            costs = self.weight * (of_cells + costs) + parameters * np.log(counts)
+            tried.append((costs, fields, counts))
+        costs, fields, counts = map(np.concatenate, zip(*tried, strict=True))
+        least = np.argmin(costs, axis=0), np.arange(groups)
+        return ErrorCost(costs[least], fields[least], counts[least])
 
 
 def farthest_error(scale: FloatArray) -> FloatArray:
     """Pixels that an error counts as at most, by half the diagonal of the images (G,), pixels."""
     return _FARTHEST * scale
-
-
-def freedom_cost(parameters: int, count: FloatArray) -> FloatArray:
-    """What parameters cost, by so many independent observations of each problem (Schwarz's criterion)."""
-    return parameters * np.log(count)

@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import cache
 from operator import attrgetter
 from pathlib import Path
 
@@ -27,6 +28,9 @@ _TOKEN = re.compile(r"\d+|[^\W\d_]+|[\W_]+")
 Chosen = list[Frame | None]
 """For each image of the registration the frame that takes its place."""
 
+_Known = tuple[float | None, GpsPosition | None]
+"""When and where an image was taken."""
+
 
 def counterparts(
     saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy
@@ -35,12 +39,13 @@ def counterparts(
     # Arrays have no names of their own.
     if match == "order" or all(frame.image is not None for frame in frames):
         return list(_by_order(saved, frames)), "order", []
+    headers = cache(_known_of_frame)  # each is read once
     ways: tuple[tuple[MatchedBy, Callable[[], Chosen | None]], ...] = (
         ("name", lambda: _by_name(saved, frames, attrgetter("name"))),
         ("name", lambda: _by_name(saved, frames, attrgetter("stem"))),
         ("name", lambda: _by_varying_part(saved, frames)),
-        ("time", lambda: _by_measurement(saved, frames, _seconds)),
-        ("position", lambda: _by_measurement(saved, frames, _metres)),
+        ("time", lambda: _by_measurement(saved, frames, _seconds, headers)),
+        ("position", lambda: _by_measurement(saved, frames, _metres, headers)),
     )
     for matched, find in ways[:3] if match == "name" else ways:
         found = find() or [None] * len(saved.images)
@@ -48,7 +53,7 @@ def counterparts(
         chosen = [None if image.to_plane is None else frame for image, frame in pairs]
         if any(frame is not None for frame in chosen):
             if matched == "name" and match == "auto":
-                _refuse_other_flights(saved, chosen)
+                _refuse_other_flights(saved, chosen, headers)
             return chosen, matched, _without_counterpart(found, frames)
     for path in files_of(frames):
         check_readable(path)
@@ -87,10 +92,10 @@ def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[P
     return chosen
 
 
-def _refuse_other_flights(saved: SavedRegistration, chosen: Chosen) -> None:
+def _refuse_other_flights(saved: SavedRegistration, chosen: Chosen, headers: Callable[[Frame], _Known]) -> None:
     """Refuse equal names of another flight, as cameras begin again at 1: times, or else places, tell them apart."""
     frames = [frame for frame in chosen if frame is not None]
-    near = _by_measurement(saved, frames, _seconds) or _by_measurement(saved, frames, _metres) or chosen
+    near = next(filter(None, (_by_measurement(saved, frames, by, headers) for by in (_seconds, _metres))), chosen)
     for image, by_name, by_place in zip(saved.images, chosen, near, strict=True):
         if by_name is not None and by_place is not None and by_name is not by_place:
             raise InputError(
@@ -123,9 +128,6 @@ def _varying_parts(names: Sequence[str]) -> list[tuple[str, ...]] | None:
     return keys if max(Counter(keys).values()) == 1 else None
 
 
-_Known = tuple[float | None, GpsPosition | None]
-
-
 def _seconds(ours: Sequence[_Known], theirs: Sequence[_Known]) -> tuple[FloatArray, FloatArray]:
     each = [np.array([np.nan if time is None else time for time, _ in known]) for known in (ours, theirs)]
     return each[0][:, None], each[1][:, None]
@@ -140,19 +142,12 @@ def _by_measurement(
     saved: SavedRegistration,
     frames: Sequence[Frame],
     measure: Callable[[Sequence[_Known], Sequence[_Known]], tuple[FloatArray, FloatArray]],
+    headers: Callable[[Frame], _Known],
 ) -> Chosen | None:
     """By what is nearer than half the way to the next registered image; None where most have no such counterpart."""
     if any(frame.image is not None or frame.number is not None for frame in frames):
         return None
-    theirs: list[_Known] = []
-    for frame in frames:
-        try:
-            metadata = read_metadata(frame.path)
-        except InputError:
-            theirs.append((None, None))  # it is left out by name, when it is read
-        else:
-            theirs.append((metadata.timestamp, metadata.gps))
-    here, there = measure([_known_of(image) for image in saved.images], theirs)
+    here, there = measure([_known_of(image) for image in saved.images], [*map(headers, frames)])
     used = np.array([image.to_plane is not None for image in saved.images])
     here = np.where(used[:, None], here, np.nan)
     known, given = (np.flatnonzero(np.isfinite(one).all(axis=1)) for one in (here, there))
@@ -168,9 +163,17 @@ def _by_measurement(
 
 
 def _known_of(image: ImageRecord) -> _Known:
-    """Time and position of a registered image."""
-    gps = None if image.gps is None else GpsPosition(*image.gps)
-    return image.timestamp, gps
+    """Of a registered image."""
+    return image.timestamp, None if image.gps is None else GpsPosition(*image.gps)
+
+
+def _known_of_frame(frame: Frame) -> _Known:
+    """By its header; of one that cannot be read, which is left out by name when its pixels are, nothing."""
+    try:
+        metadata = read_metadata(frame.path)
+    except InputError:
+        return None, None
+    return metadata.timestamp, metadata.gps
 
 
 def _by_order(saved: SavedRegistration, frames: Sequence[Frame]) -> Sequence[Frame]:

@@ -18,7 +18,7 @@ from rdstitch.geometry.crs import Crs
 from rdstitch.sidecar.records import VERSION, ImageRecord, OutputRecord, ResidualRecord, SidecarRecord
 from rdstitch.system.file_access import read_text
 from rdstitch.system.outputs import Fingerprint, fingerprint, tiles_folder
-from rdstitch.system.records import convert, parse_json
+from rdstitch.system.records import Matrix, convert, parse_json
 
 _OF_A_MACHINE = ("max_memory", "workers")  # options that the machine that wrote a sidecar had, not the picture
 
@@ -60,14 +60,12 @@ class SavedRegistration:
     @property
     def orientation(self) -> FloatArray | None:
         """What the registered images were turned by to be at ``to_plane``, (3, 3)."""
-        matrix = self.record.output.orientation
-        return None if matrix is None else np.array(matrix, dtype=np.float64)
+        return _array(self.record.output.orientation)
 
     @property
     def plane_to_output(self) -> FloatArray | None:
         """From the plane to pixels of the output, (3, 3)."""
-        matrix = self.record.output.plane_to_output
-        return None if matrix is None else np.array(matrix, dtype=np.float64)
+        return _array(self.record.output.plane_to_output)
 
     @property
     def place(self) -> Georeference | None:
@@ -75,6 +73,10 @@ class SavedRegistration:
         if self.output_place is None or self.plane_to_output is None:
             return None
         return self.output_place.after(np.linalg.inv(self.plane_to_output).astype(np.float64))
+
+
+def _array(matrix: Matrix | None) -> FloatArray | None:
+    return None if matrix is None else np.array(matrix, dtype=np.float64)
 
 
 def read_sidecar(path: str | Path) -> SavedRegistration:
@@ -139,12 +141,7 @@ def _place(output: OutputRecord) -> Georeference | None:
 
 
 def _residuals(records: Sequence[ResidualRecord]) -> tuple[Residual, ...]:
-    return tuple(
-        Residual(
-            item.name,
-            math.inf if item.east_m is None else item.east_m,
-            math.inf if item.north_m is None else item.north_m,
-            item.used,
-        )
-        for item in records
-    )
+    def off(metres: float | None) -> float:
+        return math.inf if metres is None else metres
+
+    return tuple(Residual(item.name, off(item.east_m), off(item.north_m), item.used) for item in records)

@@ -16,8 +16,7 @@ from rdstitch.geometry.camera_record import CameraRecord, FocalSource, LensRecor
 from rdstitch.local_alignment import DisplacementField, HeldOut
 from rdstitch.system.records import Count, Matrix, NonNegative, Pair, Size, Triple, check_invertible
 
-VERSION = 2
-"""Version 1 had no more of a lens than λ and μ, as ``lambda`` and ``lambda2``."""
+VERSION = 2  # version 1 had no more of a lens than λ and μ, as ``lambda`` and ``lambda2``
 
 Lens = Literal["division", "division-center", "division2", "division3"]
 Model = Literal["rigid", "similarity", "tilting", "pose", "homography", "rotation"]
@@ -249,8 +248,8 @@ class StageRecord(Struct, kw_only=True):
     tiles: list[TileRecord]
 
 
+# How given images found the registered ones whose places they take.
 MatchedBy = Literal["name", "time", "position", "order"]
-"""How given images found the registered ones whose places they take."""
 
 
 class Applied(Struct):

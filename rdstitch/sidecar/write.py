@@ -41,14 +41,7 @@ from rdstitch.system.records import to_jsonable
 
 
 def sidecar(result: StitchResult) -> dict[str, Any]:
-    """The sidecar's content; every number that does not exist is null.
-
-    ``lambda`` is for half the image diagonal. ``images[].to_plane`` maps undistorted, half-diagonal-normalized
-    coordinates of an image to the plane, or to directions where the camera turned on the spot,
-    ``output.plane_to_output`` places of the plane, or of the projection, to pixels of the output;
-    ``images[].to_output`` is the product, on a plane; ``pairs[].homography`` maps coordinates of the first image
-    to those of the second. All fields are described in docs/formats.md.
-    """
+    """The sidecar's content, as docs/formats.md describes it; every number that does not exist is null."""
     registration, alignment = result.registration, result.registration.alignment
     camera, local = registration.camera, result.local_alignment
     record = SidecarRecord(
@@ -166,7 +159,7 @@ def _pairs(registration: Registration) -> list[PairRecord]:
     names = [source.name for source in registration.sources]
 
     def record(pair: PairRegistration) -> PairRecord:
-        relation, fit = pair.relation, fits.get((pair.image1, pair.image2))
+        relation, fit = pair.relation, fits.get(pair.images)
         return PairRecord(
             images=(names[pair.image1], names[pair.image2]),
             matches=len(pair.matches),

@@ -1,6 +1,5 @@
 """The sidecar of an image that was composed again: what was estimated then, of the images that are in it now."""
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 from msgspec import UNSET
@@ -9,9 +8,6 @@ from msgspec.structs import replace as replace_fields
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera_record import CameraRecord, camera_record, lens_fields
 from rdstitch.geometry.exif_orientation import inverse
-from rdstitch.inputs.source import Source
-from rdstitch.results.messages import Message
-from rdstitch.results.stitch_result import OutputImage
 from rdstitch.sidecar.parts import (
     displacement_record,
     output_record,
@@ -21,29 +17,17 @@ from rdstitch.sidecar.parts import (
     to_output,
     versions,
 )
-from rdstitch.sidecar.read import SavedRegistration
-from rdstitch.sidecar.records import VERSION, Applied, ImageRecord, MatchedBy
+from rdstitch.sidecar.recomposition import Recomposition
+from rdstitch.sidecar.records import VERSION, Applied, ImageRecord
 from rdstitch.system.file_access import is_url
 from rdstitch.system.records import to_jsonable
 
 
-def applied_sidecar(
-    saved: SavedRegistration,
-    output: OutputImage,
-    sources: Mapping[int, Source],
-    homographies: Sequence[FloatArray],
-    left_out: Mapping[int, Message],
-    matched: MatchedBy,
-    *,
-    same_lens: bool,
-) -> dict[str, Any]:
-    """The content of the sidecar, which can be applied like any other.
-
-    ``sources`` are the images of the output, by the numbers of those whose places they take, and ``homographies``
-    theirs. Pairs are those of the sidecar that was applied, and stay there; so does how far a lens was determined that
-    took none of these images.
-    """
-    then, to_plane = saved.record, dict(zip(sources, homographies, strict=True))
+def applied_sidecar(result: Recomposition, *, same_lens: bool) -> dict[str, Any]:
+    """The content of the sidecar, which can be applied like any other; pairs stay in the one that was applied."""
+    saved, then = result.saved, result.saved.record
+    sources = {index: source for index, source in enumerate(result.sources) if source is not None}
+    to_plane = dict(zip(sources, result.placed.homographies, strict=True))
     # An image without any image in it is never written.
     source = sources.get(saved.reference) or next(iter(sources.values()))
     # How far the camera was determined then.
@@ -64,44 +48,38 @@ def applied_sidecar(
         camera=camera,
         focal_px=camera.focal_px,
         reference=source.name,
-        output=output_record(output, turned=saved.turned),
-        seams=seams_record(output.seams, [source.name for source in sources.values()]),
+        output=output_record(result, turned=saved.turned),
+        seams=seams_record(result.seams, [source.name for source in sources.values()]),
         images=[
-            _used_image(saved, image, sources[index], to_plane[index], output, same_lens=same_lens)
+            _used_image(result, index, to_plane[index], same_lens=same_lens)
             if index in sources
-            else _unused_image(saved, image, left_out.get(index), output)
-            for index, image in enumerate(saved.images)
+            else _unused_image(result, index)
+            for index in range(len(saved.images))
         ],
         pairs=[],
-        options={**then.options, "composite": output.options.composite},
+        options={**then.options, "composite": result.options.composite},
         versions=versions(),
-        applied=Applied(recorded_path(saved.path, output.output), matched),
+        applied=Applied(recorded_path(saved.path, result.output), result.matched),
     )
     content: dict[str, Any] = to_jsonable(now)
     return content
 
 
-def _used_image(
-    saved: SavedRegistration,
-    image: ImageRecord,
-    source: Source,
-    to_plane: FloatArray,
-    output: OutputImage,
-    *,
-    same_lens: bool,
-) -> ImageRecord:
+def _used_image(result: Recomposition, index: int, to_plane: FloatArray, *, same_lens: bool) -> ImageRecord:
     """The record of an image, with what took its place."""
-    field, size, original = image.displacement_field(), source.camera.image_size, saved.original(image)
+    image, source = result.saved.images[index], result.sources[index]
+    assert source is not None
+    field, size, original = image.displacement_field(), source.camera.image_size, result.saved.original(image)
     is_original = original is not None and original.resolve() == source.path.resolve()
     return replace_fields(
         image,
         name=source.name,
-        path=recorded_path(source.path, output.output),
+        path=recorded_path(source.path, result.output),
         size=size,
         features=image.features if is_original else None,
         pose=image.pose if same_lens else None,
         to_plane=to_plane.tolist(),
-        to_output=to_output(output.canvas, to_plane),
+        to_output=to_output(result.canvas, to_plane),
         displacement=displacement_record(None if field is None else field.resized(size)),
         lambda2=UNSET,
         **taken_fields(source),
@@ -109,15 +87,14 @@ def _used_image(
     )
 
 
-def _unused_image(
-    saved: SavedRegistration, image: ImageRecord, left_out: Message | None, output: OutputImage
-) -> ImageRecord:
+def _unused_image(result: Recomposition, index: int) -> ImageRecord:
     """The record of an image that is not in the output."""
+    image, left_out = result.saved.images[index], result.left_out.get(index)
     lens = {} if image.camera is None else lens_fields(image.camera)
     reason = image.reason if left_out is None else left_out.text
     gone = {"used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
     if not is_url(image.path):
-        gone["path"] = recorded_path(saved.path.parent / image.path, output.output, was_file=True)
+        gone["path"] = recorded_path(result.saved.path.parent / image.path, result.output, was_file=True)
     return replace_fields(image, **lens, **gone, lambda2=UNSET)
 
 

@@ -10,20 +10,9 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from rdstitch_cli.main import cli
 
-from rdstitch.compositing import CompositeOptions
 from rdstitch.io import read_image
 from rdstitch.io.deepzoom import read_deep_zoom
 from tests.cli.running import CACHED, Run, sidecar_of
-
-LIBRARY_ONLY = {"bands", "tile_size", "workers"}
-
-
-def test_names_and_defaults_are_the_librarys() -> None:
-    """Of apply; those of the others are compared with all options of the library."""
-    given = cli.load_all()["apply"].make_context("apply", ["a.json", "--images", ".", "-o", "out.png"]).params
-    standard = CompositeOptions()
-    for field in set(CompositeOptions.__dataclass_fields__) - LIBRARY_ONLY:
-        assert given[field] == getattr(standard, field), field
 
 
 @pytest.fixture

@@ -12,8 +12,16 @@ from rdstitch.options.shared_options import Every
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import shortened
 from rdstitch_cli.flags import ImageFile, Inputs, PrintSidecar, command, flags_of
-from rdstitch_cli.following import FOLLOWING, followed, print_result
-from rdstitch_cli.stitching import STITCHING, files_beside, report_applied, report_result, resolve, stitch_options
+from rdstitch_cli.following import Following, Idle, followed, print_result
+from rdstitch_cli.stitching import (
+    STITCHING,
+    Preview,
+    files_beside,
+    report_applied,
+    report_result,
+    resolve,
+    stitch_options,
+)
 from rdstitch_cli.terminal import Reporter
 
 
@@ -27,7 +35,6 @@ from rdstitch_cli.terminal import Reporter
 """,
     STITCHING,
     flags_of(FilesBeside),
-    FOLLOWING,
 )
 def mosaic(
     inputs: Inputs,
@@ -58,9 +65,10 @@ def mosaic(
             least=0.0,
         ),
     ] = 5.0,
+    preview: Preview = False,
     as_json: PrintSidecar = False,
-    following: bool,
-    idle: float | None,
+    following: Following = False,
+    idle: Idle = None,
     reporter: Reporter,
     **given: Any,
 ) -> None:
@@ -75,7 +83,7 @@ def mosaic(
     if bands is not None and (all_blocks or following or given["dry_run"]):
         raise click.UsageError("--bands goes neither with --all-blocks, --follow nor --dry-run")
     beside = files_beside(given)
-    options = stitch_options(given, pose_covariance=beside.poses is not None)
+    options = stitch_options(given, preview=preview, pose_covariance=beside.poses is not None)
     how: dict[str, Any] = {"every": every, "progress": reporter, "beside": beside}
     if following:
         _follow(inputs, output, options, reporter, idle=idle, refresh=refresh, as_json=as_json, **how)

@@ -5,7 +5,7 @@ from typing import Any
 from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.shared_options import Every
 from rdstitch_cli.flags import ImageFile, Inputs, PrintSidecar, command, flags_of
-from rdstitch_cli.stitching import STITCHING, files_beside, report_result, resolve, stitch_options
+from rdstitch_cli.stitching import STITCHING, Preview, files_beside, report_result, resolve, stitch_options
 from rdstitch_cli.terminal import Reporter
 
 
@@ -22,6 +22,7 @@ def pano(
     inputs: Inputs,
     output: ImageFile,
     every: Every = None,
+    preview: Preview = False,
     as_json: PrintSidecar = False,
     *,
     reporter: Reporter,
@@ -34,6 +35,6 @@ def pano(
     """
     from rdstitch.pipeline.recipes import pano as recipe
 
-    beside, options = files_beside(given), stitch_options(given)
+    beside, options = files_beside(given), stitch_options(given, preview=preview)
     result = recipe(resolve(inputs), output, options, every=every, progress=reporter, beside=beside)
     report_result(result, reporter, as_json=as_json)

@@ -11,7 +11,7 @@ from rdstitch.options.option import Option
 from rdstitch.options.shared_options import Every, Height
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch_cli.flags import Inputs, command, flags_of
-from rdstitch_cli.following import FOLLOWING, followed, print_result
+from rdstitch_cli.following import Following, Idle, followed, print_result
 from rdstitch_cli.stitching import report_registration, resolve, stitch_options
 from rdstitch_cli.terminal import Reporter
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 """,
     flags_of(StitchOptions, without="reference gcp check_points local_alignment dry_run save_camera camera_format"),
     flags_of(FeatureOptions),
-    FOLLOWING,
 )
 def trajectory(
     inputs: Inputs,
@@ -53,8 +52,8 @@ def trajectory(
     height: Height = None,
     plot: Annotated[Path | None, Option("Draw the path to FILE (SVG).", "FILE", writes=True)] = None,
     every: Every = 1,
-    following: bool,
-    idle: float | None,
+    following: Following = False,
+    idle: Idle = None,
     reporter: Reporter,
     **given: Any,
 ) -> None:

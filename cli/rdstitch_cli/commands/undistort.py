@@ -1,7 +1,7 @@
 """``rdstitch undistort``: straight lines become straight."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import click
 
@@ -9,7 +9,7 @@ from rdstitch.choices import Framing, ImageFormat
 from rdstitch.options.option import Option
 from rdstitch.options.shared_options import Distortion, Overwrite, Topic
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch_cli.flags import Inputs, command, flags, flags_of
+from rdstitch_cli.flags import Inputs, command, flags_of
 from rdstitch_cli.stitching import resolve
 from rdstitch_cli.terminal import Reporter
 
@@ -20,7 +20,6 @@ from rdstitch_cli.terminal import Reporter
   rdstitch undistort wall.jpg --lambda -0.25 -o straight/
 """,
     flags_of(StitchOptions, only="camera"),
-    flags(distortion=(Distortion, None), overwrite=(Overwrite, False), topic=(Topic, None)),
 )
 def undistort(
     inputs: Inputs,
@@ -36,9 +35,11 @@ def undistort(
             flag="--format",
         ),
     ] = None,
+    distortion: Distortion = None,
+    overwrite: Overwrite = False,
+    topic: Topic = None,
     *,
     reporter: Reporter,
-    **given: Any,
 ) -> None:
     """Undistort images with a known lens, each into a file of the same name in a folder.
 
@@ -47,10 +48,20 @@ def undistort(
     """
     from rdstitch.pipeline.undistort_images import undistort as recipe
 
-    if (camera is None) == (given["distortion"] is None):
+    if (camera is None) == (distortion is None):
         raise click.UsageError("give either --camera FILE or --lambda L")
-    how = {"camera": camera, "view": view, "image_format": image_format, **given}
-    written = recipe(resolve(inputs), output, warn=reporter.tell, progress=reporter, **how)
+    written = recipe(
+        resolve(inputs),
+        output,
+        camera=camera,
+        distortion=distortion,
+        view=view,
+        image_format=image_format,
+        overwrite=overwrite,
+        topic=topic,
+        warn=reporter.tell,
+        progress=reporter,
+    )
     reporter.finish()
     noun = "image" if len(written) == 1 else "images"
     reporter.made(f"{output}: {len(written)} {noun} undistorted")

@@ -10,10 +10,8 @@ from examples.worlds.alignment_scenes import grid, scene
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
-from rdstitch.executors import open_executor
 from rdstitch.features import Correspondences, FeatureOptions
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import write_image
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.links import Link
@@ -23,45 +21,36 @@ from rdstitch.pipeline.accept import accept
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner, reselect_inliers, select_by_whole_lens
 from rdstitch.pipeline.realign import realigned, without
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.pipeline.register import register
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message, left_out
 from rdstitch.system.cache import NO_CACHE
 from rdstitch.verification.verdict import RefusedError
 from tests.cli.running import flight
-from tests.registrations import registration
+from tests.registrations import registered, registration
 from tests.sampled import sampled
 
 OPTIONS = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
 
 
-def _read(frames: list[Path]) -> list[Source]:
-    return read_sources(frames, camera=None, focal=380.0, distortion=None, skip_bad=False)[0]
-
-
 def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Path) -> None:
     """The pair of the other two images had been dropped for contradicting the third one, and 0 with it."""
     frames = flight(3, 3).write(tmp_path)
-    sources = _read(frames)
-    with open_executor(1, len(sources)) as executor:
-        found = register(sources, Run(OPTIONS), executor)
+    found = registered(frames, OPTIONS)
     links = tuple(replace(fit, used=2 in (fit.image1, fit.image2)) for fit in found.alignment.links)
     spoiled = replace(
         found,
         alignment=replace(found.alignment, links=links, used=found.alignment.used & [False, True, True]),
         messages=(left_out(frames[0], "contradicts"),),
     )
-    rest = without(spoiled, {(2,): Message("shows something else")}, Aligner.of(sources, OPTIONS, NO_CACHE))
+    rest = without(spoiled, {(2,): Message("shows something else")}, Aligner.of(found.sources, OPTIONS, NO_CACHE))
     assert rest.alignment.used.tolist() == [True, True, False]
     assert [str(message) for message in rest.left_out] == [f"left out {frames[2]}: shows something else [left-out]"]
 
 
 def test_what_was_left_out_stays_out_of_other_hypotheses(tmp_path: Path) -> None:
-    sources = _read(flight(3, 3).write(tmp_path))
-    with open_executor(1, len(sources)) as executor:
-        found = register(sources, Run(OPTIONS), executor)
+    found = registered(flight(3, 3).write(tmp_path), OPTIONS)
     accepted = replace(found, alignment=replace(found.alignment, used=np.array([True, True, False])))
-    other = realigned(accepted, Aligner.of(sources, replace(OPTIONS, model="rigid"), NO_CACHE), lambda _: True)
+    other = realigned(accepted, Aligner.of(found.sources, replace(OPTIONS, model="rigid"), NO_CACHE), lambda _: True)
     assert other is not None
     assert other.alignment.used.tolist() == [True, True, False]
 
@@ -91,10 +80,8 @@ def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path:
     frames = plane.write(tmp_path)
     for k, frame in enumerate(frames):
         write_image(frame, np.concatenate([plane.frame(k)[:192], ahead.frame(k)[192:]]))
-    sources = _read(frames)
-    with open_executor(1, len(sources)) as executor:
-        found = register(sources, Run(OPTIONS), executor)
-        accepted = accept(found, Run(OPTIONS, purpose=Purpose.TRAJECTORY))
+    found = registered(frames, OPTIONS)
+    accepted = accept(found, Run(OPTIONS, purpose=Purpose.TRAJECTORY))
     picture = mosaic(frames, None, replace(OPTIONS, focal=380.0)).registration
     steps = [np.diff(k.alignment.homographies[:, 0, 2]) for k in (found, accepted, picture)]
     assert np.all(np.abs(steps[0]) < 0.2)  # heights above the ground: what drives ahead moves by a sixth
@@ -105,12 +92,11 @@ def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path:
 
 def test_what_the_alignment_itself_fails_by_is_refused(tmp_path: Path) -> None:
     """Such as depth that looks like a lens, of a calibration."""
-    sources = _read(flight(2, 2).write(tmp_path))
-    with open_executor(1, len(sources)) as executor:
-        found = register(sources, Run(OPTIONS), executor).with_messages([Message("no lens shows", severity="failure")])
-        with pytest.raises(RefusedError, match="no lens shows"):
-            accept(found, Run(OPTIONS))
-        assert not accept(found, Run(replace(OPTIONS, force=True))).ok
+    failure = Message("no lens shows", severity="failure")
+    found = registered(flight(2, 2).write(tmp_path), OPTIONS).with_messages([failure])
+    with pytest.raises(RefusedError, match="no lens shows"):
+        accept(found, Run(OPTIONS))
+    assert not accept(found, Run(replace(OPTIONS, force=True))).ok
 
 
 FISHEYE = Camera((640, 480), -0.49, -0.055, (335.0, 226.0), distortion3=-0.008)
@@ -134,15 +120,15 @@ def _registered(link: Link) -> PairRegistration:
 
 
 @pytest.fixture(scope="module")
-def registered() -> tuple[Aligner, list[PairRegistration], list[Link]]:
+def curved() -> tuple[Aligner, list[PairRegistration], list[Link]]:
     rng = np.random.default_rng(0)
     given = scene(grid(4, 3, (0.4, 0.35), np.pi, rng), lens=FISHEYE, rng=rng, noise=0.25, focal=420.0)
     aligner = Aligner(tuple(map(str, range(12))), tuple(given.cameras), AlignmentOptions(), NO_CACHE, 3.0)
     return aligner, [_registered(link) for link in given.links], given.links
 
 
-def test_corners_come_back_and_outliers_go(registered: tuple[Aligner, list[PairRegistration], list[Link]]) -> None:
-    aligner, pairs, links = registered
+def test_corners_come_back_and_outliers_go(curved: tuple[Aligner, list[PairRegistration], list[Link]]) -> None:
+    aligner, pairs, links = curved
     alignment = aligner.align(pairs).alignment
     assert alignment.lens in ("division2", "division3")
     selected = reselect_inliers(pairs, alignment, 3.0)
@@ -156,8 +142,8 @@ def test_corners_come_back_and_outliers_go(registered: tuple[Aligner, list[PairR
     assert sum(pair.relation.inliers.sum() for pair in again.values()) < 0.8 * inliers.sum()
 
 
-def test_a_pair_that_does_not_fit_stays(registered: tuple[Aligner, list[PairRegistration], list[Link]]) -> None:
-    aligner, pairs, _ = registered
+def test_a_pair_that_does_not_fit_stays(curved: tuple[Aligner, list[PairRegistration], list[Link]]) -> None:
+    aligner, pairs, _ = curved
     alignment = aligner.align(pairs).alignment
     moved = replace(pairs[0].correspondences, points2=pairs[0].correspondences.points2 + 9.0)
     selected = reselect_inliers([replace(pairs[0], matches=StoredMatches.of(moved)), *pairs[1:]], alignment, 3.0)
@@ -166,8 +152,8 @@ def test_a_pair_that_does_not_fit_stays(registered: tuple[Aligner, list[PairRegi
 
 
 @pytest.mark.parametrize("lens", sampled(["division", "auto"]))
-def test_only_a_rich_lens_needs_it(registered: tuple[Aligner, list[PairRegistration], list[Link]], lens: str) -> None:
-    aligner, pairs, _ = registered
+def test_only_a_rich_lens_needs_it(curved: tuple[Aligner, list[PairRegistration], list[Link]], lens: str) -> None:
+    aligner, pairs, _ = curved
     aligner = replace(aligner, options=AlignmentOptions(lens=lens))
     aligned = aligner.draft(pairs)
     selected = select_by_whole_lens(aligned, aligner.threshold)
@@ -181,8 +167,8 @@ def test_only_a_rich_lens_needs_it(registered: tuple[Aligner, list[PairRegistrat
     assert select_by_whole_lens(again, aligner.threshold) is None
 
 
-def test_a_draft_lacks_uncertainties(registered: tuple[Aligner, list[PairRegistration], list[Link]]) -> None:
-    aligner, pairs, _ = registered
+def test_a_draft_lacks_uncertainties(curved: tuple[Aligner, list[PairRegistration], list[Link]]) -> None:
+    aligner, pairs, _ = curved
     draft = aligner.draft(pairs)
     complete = aligner.completed(draft)
     assert aligner.completed(complete) is complete

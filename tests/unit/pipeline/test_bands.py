@@ -125,10 +125,15 @@ def test_all_bands_of_a_rig_at_once(rig: Path, tmp_path: Path) -> None:
         assert cogeo.cog_validate(tmp_path / file, quiet=True) == (True, [], [])
 
 
-def test_of_bands_of_which_one_fails_nothing_is_written(rig: Path, tmp_path: Path) -> None:
+def _write_shifted(rig: Path, folder: Path) -> None:
+    """The images of the second band, each shifted by something else."""
     for k, file in enumerate(sorted((rig / "nir").iterdir())):
         image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        cv2.imwrite(str(tmp_path / file.name), np.roll(image, (12 * k, -9 * k), axis=(0, 1)))
+        cv2.imwrite(str(folder / file.name), np.roll(image, (12 * k, -9 * k), axis=(0, 1)))
+
+
+def test_of_bands_of_which_one_fails_nothing_is_written(rig: Path, tmp_path: Path) -> None:
+    _write_shifted(rig, tmp_path)
     inputs = set(tmp_path.iterdir())
     with pytest.raises(InputError, match="was not taken from the same place"):
         mosaic_bands([rig / "red", tmp_path], tmp_path / "f.tif", {"R": "*_red.png", "N": "*_nir.png"})
@@ -160,10 +165,7 @@ def test_a_lost_image_and_one_from_elsewhere_move_no_other(rig: Path, tmp_path: 
 
 
 def test_images_of_other_places_are_refused(rig: Path, tmp_path: Path) -> None:
-    """Under right names, shifted each by something else."""
-    for k, file in enumerate(sorted((rig / "nir").iterdir())):
-        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-        cv2.imwrite(str(tmp_path / file.name), np.roll(image, (12 * k, -9 * k), axis=(0, 1)))
+    _write_shifted(rig, tmp_path)
     with pytest.raises(InputError, match="was not taken from the same place"):
         apply(rig / "red.tif.json", [tmp_path], workers=1)
     unlike = [tmp_path / f"{word}.png" for word in ("one", "two", "three", "four", "five", "six")]

@@ -10,22 +10,20 @@ import pytest
 from examples.worlds.trust_sets import judge_set, trust_set
 from rdstitch.choices import Purpose
 from rdstitch.compositing import CompositeOptions, SeamBreak, SeamQuality
-from rdstitch.executors import open_executor
-from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.choose_layout import _alternatives, _error, _Trials, choose_layout
 from rdstitch.pipeline.compose import CanvasPlan
 from rdstitch.pipeline.lay_out import is_stretched
 from rdstitch.pipeline.realign import aligner_of, by_second_motions
 from rdstitch.pipeline.recipes import mosaic, pano
-from rdstitch.pipeline.register import register
-from rdstitch.pipeline.run import Run
 from rdstitch.results.placed_images import PlacedImages
+from rdstitch.results.registration import Registration
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification.output_messages import seam_messages
-from tests.registrations import CAMERA, source
+from tests.registrations import CAMERA, registered, source
 
 
 def _of_two_surfaces(folder: Path) -> list[Path]:
@@ -40,6 +38,18 @@ def _of_two_surfaces(folder: Path) -> list[Path]:
     for path, pixels in zip(paths, (scene[:, :520], second), strict=True):
         write_image(path, pixels)
     return paths
+
+
+OPTIONS = StitchOptions(workers=1, local_alignment="off", model="rigid", distortion=0.0)
+
+
+def _aligned_by_both(folder: Path) -> tuple[Registration, Registration, Aligner]:
+    """By either surface, the farther one first."""
+    far = registered(_of_two_surfaces(folder), OPTIONS, focal=None)
+    aligner = aligner_of(far, OPTIONS, Purpose.MOSAIC)
+    near = by_second_motions(far, [(0, 1)], aligner)
+    assert near is not None
+    return far, near, aligner
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.2])  # seams are judged by the images, whatever the size of the output
@@ -59,32 +69,20 @@ def test_where_a_part_of_the_scene_is_nearer_one_line_says_where_its_lines_break
 
 
 def test_images_aligned_by_the_surface_whose_seams_break_are_aligned_by_the_other(tmp_path: Path) -> None:
-    options = StitchOptions(workers=1, local_alignment="off", model="rigid", distortion=0.0)
-    sources = read_sources(_of_two_surfaces(tmp_path), camera=None, focal=None, distortion=0.0, skip_bad=False)[0]
-    with open_executor(1, len(sources)) as executor:
-        far = register(sources, Run(options), executor)
-    aligner = aligner_of(far, options, Purpose.MOSAIC)
-    near = by_second_motions(far, [(0, 1)], aligner)
-    assert near is not None
+    far, near, aligner = _aligned_by_both(tmp_path)
     offsets = [one.alignment.transfer(0, 1, np.array([[380.0, 240.0]]))[0] for one in (far, near)]
     np.testing.assert_allclose(offsets[1] - offsets[0], [9.0, 13.0], atol=0.5)
     assert _error(near) < 1.0
     assert _error(replace(far, alignment=near.alignment)) > 10.0  # the far matches count, though none of them fits
     for given in (far, near):
-        chosen = choose_layout(given, options, aligner).registration.alignment
+        chosen = choose_layout(given, OPTIONS, aligner).registration.alignment
         np.testing.assert_allclose(chosen.transfer(0, 1, np.array([[380.0, 240.0]]))[0], offsets[0], atol=0.1)
 
 
 @pytest.mark.parametrize("by_heights", [False, True])
 def test_where_heights_of_the_ground_explain_parallax_no_other_model_is_tried(by_heights: bool, tmp_path: Path) -> None:
-    options = StitchOptions(workers=1, local_alignment="off", model="rigid", distortion=0.0)
-    sources = read_sources(_of_two_surfaces(tmp_path), camera=None, focal=None, distortion=0.0, skip_bad=False)[0]
-    with open_executor(1, len(sources)) as executor:
-        far = register(sources, Run(options), executor)
-    aligner = aligner_of(far, options, Purpose.MOSAIC)
-    near = by_second_motions(far, [(0, 1)], aligner)
-    assert near is not None
-    trials = _Trials(options, False, lambda image: np.empty((0, 2, 2)))
+    _, near, aligner = _aligned_by_both(tmp_path)
+    trials = _Trials(OPTIONS, False, lambda image: np.empty((0, 2, 2)))
     first = trials.lay_out(near, replace(no_local_alignment(""), by_heights=by_heights))
     assert first.faults
     assert bool(list(_alternatives(near, [first], trials, aligner))) is not by_heights

@@ -189,6 +189,13 @@ def test_noise_counts_match_by_match_and_a_field_cell_by_cell() -> None:
     assert as_noise.cost < as_field.cost
 
 
+def test_next_to_the_same_errors_cost_next_to_the_same() -> None:
+    errors = (_shared(5, 300, 1.0) + independent_errors(5, 300, 1.0)).reshape(-1, 2)
+    evidence = evidence_of(observations(errors.reshape(5, 300, 2)), independent_errors(5, 300, 1.0).reshape(-1, 2))
+    costs = [evidence.cost(errors * size, parameters=60).cost[0] for size in np.geomspace(0.5, 4.0, 400)]
+    assert np.abs(np.diff(costs)).max() < 5.0
+
+
 def test_links_between_few_images_measure_the_same_again() -> None:
     errors = independent_errors(links=9)  # between six images, which five links would join
     assert evidence_of(observations(errors), errors.reshape(-1, 2)).weight == [pytest.approx(5 / 9)]

@@ -12,16 +12,12 @@ import pytest
 from examples.worlds.turns import camera_rotations, turning_sequence
 from rdstitch.alignment.result import LinkFit
 from rdstitch.choices import Purpose
-from rdstitch.executors import open_executor
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
 from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import pano
-from rdstitch.pipeline.register import register
-from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.synthetic import Photometry
@@ -32,7 +28,7 @@ from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
 from rdstitch.verification.self_similarity import Ambiguity
 from tests.cli.running import flight
-from tests.registrations import evidence, registration
+from tests.registrations import evidence, registered, registration
 
 THRESHOLD = 3.0
 
@@ -41,10 +37,7 @@ THRESHOLD = 3.0
 def good(tmp_path_factory: pytest.TempPathFactory) -> Registration:
     """Three images in a chain, rightly registered."""
     frames = flight(3, 3).write(tmp_path_factory.mktemp("good"))
-    sources, _ = read_sources(frames, camera=None, focal=380.0, distortion=None, skip_bad=False)
-    options = StitchOptions(workers=1, features=FeatureOptions(max_features=600))
-    with open_executor(1, len(sources)) as executor:
-        return register(sources, Run(options), executor)
+    return registered(frames, StitchOptions(workers=1, features=FeatureOptions(max_features=600)))
 
 
 def judge(registration: Registration, threshold: float, purpose: Purpose = Purpose.MOSAIC) -> tuple[Message, ...]:

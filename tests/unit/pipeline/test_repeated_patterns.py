@@ -18,7 +18,7 @@ from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import write_image
 from rdstitch.pipeline import register as stages
-from rdstitch.pipeline import settle_repeated_pattern
+from rdstitch.pipeline import repeated_patterns
 from rdstitch.synthetic import ImageTexture, Photometry, Sequence, grid_poses, ground, repeated, sequence_over
 from rdstitch.verification.unique_places import UniqueShift
 
@@ -56,7 +56,7 @@ def test_saddles_of_other_ground_change_nothing(monkeypatch: pytest.MonkeyPatch)
     poses = grid_poses(_LENS, 3, 1, overlap=0.6, seed=3)
     frames = sequence_over(partial(ground, seed=2), _LENS, poses, seed=3).frames()
     plain = rdstitch.calibrate(frames, _OPTIONS)
-    monkeypatch.setattr(settle_repeated_pattern, "shows_repeated_pattern", lambda estimator: True)
+    monkeypatch.setattr(repeated_patterns, "shows_repeated_pattern", lambda estimator: True)
     found = rdstitch.calibrate(frames, _OPTIONS)
     assert found.camera == plain.camera
 
@@ -91,8 +91,8 @@ def test_images_that_look_alike_nowhere_else_keep_their_places(monkeypatch: pyte
     # As over a car park beside a meadow: keypoints repeat, but an image shows too few periods to find stains in.
     sequence = sequence_over(partial(ground, seed=2), LENS, grid_poses(LENS, 3, 1, overlap=0.6, seed=3), seed=3)
     decided = {(0, 1): UniqueShift(np.zeros(2), 1.0, 1.0, 0.0)}
-    monkeypatch.setattr(settle_repeated_pattern, "shows_repeated_pattern", lambda estimator: True)
-    monkeypatch.setattr(settle_repeated_pattern, "unique_shifts", lambda placed, pairs, workers: decided)
+    monkeypatch.setattr(repeated_patterns, "shows_repeated_pattern", lambda estimator: True)
+    monkeypatch.setattr(repeated_patterns, "unique_shifts", lambda placed, pairs, workers: decided)
     result = rdstitch.mosaic([sequence.frame(k) for k in range(3)], None, OPTIONS)
     assert result.registration.alignment.used.all(), result.registration.messages
 
