@@ -92,7 +92,7 @@ class Parallax:
         return sizes
 
     @cached_property
-    def _feet(self) -> tuple[FloatArray, FloatArray]:
+    def _nadirs(self) -> tuple[FloatArray, FloatArray]:
         """What each camera is above (N, 2), and how high it is (N,); roughly, in some unit, without poses."""
         model, parameters = self.adjuster.model, self.adjusted.parameters
         if not model.has_metric_poses:
@@ -112,8 +112,8 @@ class Parallax:
             return shift
         lens, matrices = self.adjusted.parameters.lens, self.adjusted.matrices.matrices[images]
         distortion, higher, _ = split_lens(lens)
-        feet, heights = self._feet
-        away = (place - feet[images]) / heights[images, None]
+        nadirs, heights = self._nadirs
+        away = (place - nadirs[images]) / heights[images, None]
         ends = []
         for step in (_STEP, -_STEP):
             lifted = np.column_stack([place + step * self.size * away, np.ones(len(place))])
@@ -157,10 +157,10 @@ class ReliefField:
     def _steps_by_waves(self, agreement: float) -> tuple[FloatArray, FloatArray]:
         """By relief as steep as leaves the agreement of errors that was found, px²."""
         step = _WAVES // _BANDS
-        answers = [self._answers(self._waves(start, step), 2 * step) for start in range(0, _WAVES, step)]
-        left = float(np.mean([left for left, *_ in answers]))
+        responses = [self._response_to(self._waves(start, step), 2 * step) for start in range(0, _WAVES, step)]
+        left = float(np.mean([left for left, *_ in responses]))
         scale = math.sqrt(agreement / left / (2 * _WAVES)) if left > 0.0 else 0.0
-        poses, shared = (np.concatenate([answer[k] for answer in answers], axis=-1) for k in (1, 2))
+        poses, shared = (np.concatenate([response[k] for response in responses], axis=-1) for k in (1, 2))
         return poses * scale, shared * scale
 
     def _steps_by_curvature(self) -> tuple[FloatArray, FloatArray]:
@@ -196,7 +196,7 @@ class ReliefField:
         o, errors = self.response.adjuster.observations, self._errors
         products = np.einsum("mi,mi->m", errors[first], errors[second])
         off, power = products - products.mean(), float((errors[np.unique(self._pairs)] ** 2).mean())
-        found = float(products.mean()) - power * self._answers(_independent, _NOISE_FIELDS)[0]
+        found = float(products.mean()) - power * self._response_to(_independent, _NOISE_FIELDS)[0]
         # Errors of a link depend on each other; of one link alone that does not show.
         variance = max((np.bincount(o.link[first], off, len(o)) ** 2).sum(), (off**2).sum()) / len(first) ** 2
         # Less what chance makes of it: the positive part of James and Stein's estimate.
@@ -213,7 +213,7 @@ class ReliefField:
             [part.errors + self.response.changes(part, *step)[..., 0] for part in self.response.parts()]
         )
 
-    def _answers(self, fields: Fields, columns: int) -> tuple[float, FloatArray, FloatArray]:
+    def _response_to(self, fields: Fields, columns: int) -> tuple[float, FloatArray, FloatArray]:
         """Agreement of neighbours, px², that fields leave in the mean, and the steps that answer each, (N, D, C) and
         (S, C).
         """
