@@ -35,14 +35,6 @@ Grey = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class _Shifts:
-    """Patches of one pair of images."""
-
-    points: FloatArray  # (P, 2): pixels of the registered image
-    others: FloatArray  # (P, 2): where the other image shows the same
-
-
-@dataclass(frozen=True, eq=False)
 class BandLens:
     """How another lens beside the registered one sees."""
 
@@ -128,8 +120,8 @@ def _coarse_shift(first: Grey, second: Grey) -> FloatArray:
     return moved
 
 
-def _patch_shifts(first: Grey, second: Grey, expected: Callable[[FloatArray], FloatArray]) -> _Shifts:
-    """Patches of the first image, and where the second one shows them, near where that is expected."""
+def _patch_shifts(first: Grey, second: Grey, expected: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    """Middles of patches of the first image, and where the second shows them near where expected, (2, P, 2)."""
     height, width = first.shape
     side = max(32, max(width, height) // _PATCHES // 2 * 2)
     corners = np.array(
@@ -138,18 +130,17 @@ def _patch_shifts(first: Grey, second: Grey, expected: Callable[[FloatArray], Fl
     points = corners.astype(np.float64).reshape(-1, 2) + (side - 1) / 2
     starts = np.rint(expected(points) - points)
     starts = np.where(np.isfinite(starts), starts, 0.0).astype(np.intp) + corners.reshape(-1, 2)
-    kept, others = [], []
+    found = []
     for (x, y), (u, v), point in zip(corners.reshape(-1, 2).tolist(), starts.tolist(), points, strict=True):
         if 0 <= u <= width - side and 0 <= v <= height - side:
             moved = _shift(first[y : y + side, x : x + side], second[v : v + side, u : u + side])
-            kept.append(point)
-            others.append(point + moved + np.array([u - x, v - y]))
-    return _Shifts(np.array(kept).reshape(-1, 2), np.array(others).reshape(-1, 2))
+            found.append((point, point + moved + np.array([u - x, v - y])))
+    return np.array(found).reshape(-1, 2, 2).swapaxes(0, 1)
 
 
-def _fit(camera: Camera, shifts: Sequence[_Shifts]) -> BandLens | None:
-    """The lens that most patches agree with; None where few do."""
-    points, others = (np.concatenate([getattr(each, name) for each in shifts]) for name in ("points", "others"))
+def _fit(camera: Camera, shifts: Sequence[FloatArray]) -> BandLens | None:
+    """The lens that most patches of all images agree with; None where few do."""
+    points, others = np.concatenate(shifts, axis=1)
     if len(points) < 9:
         return None
     near = _AGREEING * math.hypot(*camera.image_size)
@@ -181,14 +172,13 @@ def _refuse_other_places(
     diagonal = math.hypot(*edges[0][0].shape)
     sure = []
     for (first, second), shift in zip(edges, coarse, strict=True):
-        shifts = _patch_shifts(first, second, partial(np.add, shift))
-        away = np.linalg.norm(shifts.others - shifts.points - shift, axis=1)
+        points, others = _patch_shifts(first, second, partial(np.add, shift))
+        away = np.linalg.norm(others - points - shift, axis=1)
         sure.append(len(away) > 0 and float((away < 3.0 * _AGREEING * diagonal).mean()) > _ENOUGH)
-    certain = np.array(sure)
-    if certain.sum() < 2:
+    if sum(sure) < 2:
         return
-    shifts_of = np.array(coarse)
-    off = np.where(certain, np.linalg.norm(shifts_of - np.median(shifts_of[certain], axis=0), axis=1), 0.0)
+    shifts = np.array(coarse)
+    off = np.where(sure, np.linalg.norm(shifts - np.median(shifts[sure], axis=0), axis=1), 0.0)
     worst = int(np.argmax(off))
     if off[worst] > _ELSEWHERE * diagonal:
         registered, given = compared[worst]
