@@ -26,9 +26,15 @@ from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
 from rdstitch.matching.copies import copies_of, distinct
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.align_locally import align_registration_locally, straight_edges
 from rdstitch.pipeline.aligner import Aligner
-from rdstitch.pipeline.lay_out import IMAGE_GRID, CandidateLayout, is_stretched, lay_out
+from rdstitch.pipeline.lay_out import (
+    IMAGE_GRID,
+    CandidateLayout,
+    align_registration_locally,
+    is_stretched,
+    lay_out,
+    straight_edges,
+)
 from rdstitch.pipeline.realign import by_second_motions, plane_of_most, realigned
 from rdstitch.pipeline.register import with_frontal_reference
 from rdstitch.pipeline.whole_pixels import on_whole_pixels

@@ -23,7 +23,7 @@ from rdstitch.local_alignment.field import grid_shape, node_points
 from rdstitch.local_alignment.fit import Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches, place_matches
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.pipeline.align_locally import align_registration_locally
+from rdstitch.pipeline.lay_out import align_registration_locally
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
 from tests.registrations import registration
 
