@@ -42,6 +42,11 @@ class ResultEvidence:
         """The links that the alignment uses."""
         return [fit for fit in self.alignment.links if fit.used]
 
+    @property
+    def worst(self) -> LinkFit:
+        """The link with the largest errors."""
+        return max(self.used, key=lambda fit: fit.rms)
+
     @cached_property
     def _images(self) -> ComparedImages:
         return ComparedImages(self.registration.sources, self.registration.stretch, self.threads)
@@ -66,12 +71,12 @@ class ResultEvidence:
             return False
         overlaps = [link.agreement for link in self.checked if len({*images} & {*link.pair}) == len(images)]
         cells, confirming = sum(each.cells for each in overlaps), sum(each.confirming for each in overlaps)
-        return cells >= Limits.min_cells.value and confirming >= Limits.max_unlike_fraction.value * cells
+        return cells >= Limits.min_cells and confirming >= Limits.max_unlike_fraction * cells
 
     @cached_property
     def alike_fraction(self) -> float:
         """How much alike images look where most pairs put them, [0, 1]; 0 where there is nothing to see."""
-        shares = [link.agreement.share for link in self.checked if link.agreement.cells >= Limits.min_cells.value]
+        shares = [link.agreement.share for link in self.checked if link.agreement.cells >= Limits.min_cells]
         return float(np.median(shares)) if shares else 0.0
 
     @property
