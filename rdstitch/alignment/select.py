@@ -16,8 +16,8 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.frames.reference_frame import MAX_STRETCH
-from rdstitch.alignment.least_squares.link_equations import split_lens, whitened_errors
+from rdstitch.alignment.frames.reference_frame import MAX_STRETCH, stretch
+from rdstitch.alignment.least_squares.link_equations import whitened_errors
 from rdstitch.alignment.lens.lens_selection import NO_COHERENCE, residual_coherence
 from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.alignment.noise import evidence_of
@@ -25,42 +25,7 @@ from rdstitch.alignment.pairwise import fit_pairwise, fit_trial
 from rdstitch.alignment.starts import fit_model
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.choices import Purpose
-from rdstitch.geometry.division_model import undistort
-from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.posterior import TWENTY_TO_ONE, Evidence
-
-_GRID = np.stack(np.meshgrid([-0.8, 0.0, 0.8], [-0.6, 0.0, 0.6]), axis=-1).reshape(-1, 2)
-"""Half diagonals: points of an image of usual proportions, out to the corners."""
-
-_FRAMES = 12  # images that are tried as the frame of a plane without a metric
-
-
-def stretch(fit: Fit) -> float:
-    """Return the ratio of the areas that a pixel gets, 98 % over 2 % of all images; inf where they are folded.
-
-    On a sphere every direction has the same room. A plane that has no metric is seen as the image shows it that does so
-    best.
-    """
-    if fit.model.on_sphere:
-        return 1.0
-    distortion, higher, center = split_lens(fit.adjusted.parameters.lens)
-    undistorted = undistort(_GRID - center, distortion, higher)
-    rays = np.column_stack([undistorted, np.ones(len(_GRID))])
-    matrices = fit.adjusted.matrices.matrices
-    to_plane = inverses(matrices)
-    if fit.model.one_camera:
-        return _ratio(rays, to_plane)
-    return min(_ratio(rays, frame @ to_plane) for frame in matrices[:: -(-len(matrices) // _FRAMES)])
-
-
-def _ratio(rays: FloatArray, to_plane: FloatArray) -> float:
-    """Ratio of the areas around rays (P, 3) of all images, whose homographies are (N, 3, 3)."""
-    depth = rays @ to_plane[:, 2].T
-    with np.errstate(all="ignore"):
-        areas = np.abs(np.linalg.det(to_plane)) / depth**3
-    low, high = np.quantile(np.where(areas > 0.0, areas, np.inf), [0.02, 0.98], method="nearest")
-    return float(high / low) if np.isfinite(low) else np.inf
-
 
 _MIN_RATIO = 3.0
 """Times by which the errors of one camera must exceed those of free homographies, one an image: these fit relief better

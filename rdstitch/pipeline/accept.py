@@ -152,7 +152,7 @@ def agreement(links: Sequence[LinkFit], count: int) -> np.ndarray:
 
 def scale_uncertainty(alignment: Alignment) -> list[Message]:
     """A warning where the focal length, and with it the length of every step, is hardly known."""
-    if not alignment.length_std > Limits.max_length_std.value:
+    if not alignment.length_std > Limits.max_length_std:
         return []
     off = f"all lengths may be off together by {alignment.length_std:.0%}"
     text = f"{off}: the images hardly show the focal length; give --focal"

@@ -196,7 +196,11 @@ def _lens_of_band(
             read, _ = read_sources([Frame(file)], skip_bad=True)
             if read and read[0].metadata.size == size:
                 pairs[index] = replace(read[0], camera=camera), used[index]
-    return band_lens(pairs, lambda done, total: progress("comparing bands", done, total))
+    lens = band_lens(pairs, lambda done, total: progress("comparing bands", done, total))
+    if lens is None:
+        return None, []
+    text = f"{lens.shift:.1f} pixels (median) from the registered band, {lens.error:.1f} with its lens registered too"
+    return lens, [Message(text, severity="note", code="band-lens")]
 
 
 def _placed(saved: SavedRegistration, used: Mapping[int, Source], lens: BandLens | None) -> PlacedImages:

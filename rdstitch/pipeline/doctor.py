@@ -276,6 +276,6 @@ def _focal(sources: Sequence[Source]) -> tuple[str, bool]:
     if not pixels:
         return "not known from EXIF; it is guessed, which matters for trajectory only", False
     shares = [focal / side for focal, side in pixels]
-    zoomed = max(shares) > Limits.max_focal_ratio.value * min(shares)
+    zoomed = max(shares) > Limits.max_focal_ratio * min(shares)
     text = f"{min(pixels)[0]:.0f}" + (f" to {max(pixels)[0]:.0f}" if zoomed else "")
     return f"{text} pixels by EXIF in {len(pixels)} of {len(sources)} images", zoomed

@@ -129,4 +129,4 @@ def is_stretched(plan: CanvasPlan) -> bool:
     every = np.concatenate(magnification)
     largest = float(every[:, 0].max() / np.median(every[:, 0]))
     aspect = float(np.median(every[:, 0] / every[:, 1]))
-    return largest > Limits.max_magnification.value or aspect > Limits.max_aspect.value
+    return largest > Limits.max_magnification or aspect > Limits.max_aspect

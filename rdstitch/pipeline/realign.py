@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from rdstitch.alignment.result import Alignment
-from rdstitch.alignment.unaligned import explain_unaligned
+from rdstitch.alignment.sentences import explain_unaligned
 from rdstitch.choices import Purpose
 from rdstitch.errors import RegistrationError
 from rdstitch.matching.copies import copies_of

@@ -7,7 +7,7 @@ from functools import partial
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
-from rdstitch.alignment.unaligned import explain_unaligned
+from rdstitch.alignment.sentences import explain_unaligned
 from rdstitch.features import LightGlue, match
 from rdstitch.inputs.positions import positions_of
 from rdstitch.inputs.source import Source

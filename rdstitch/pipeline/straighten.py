@@ -45,7 +45,7 @@ def oriented(placed: PlacedImages, options: CompositeOptions) -> tuple[PlacedIma
     upright, messages = _upright(placed, options) if options.upright else (None, [])
     if upright is not None and options.straighten == "auto":
         before, after = (_cut_away(placed, options, turn) for turn in (np.eye(3), upright))
-        if after > before + Limits.max_straightening_cut.value:
+        if after > before + Limits.max_straightening_cut:
             text = f"not straightened: {after:.0%} of what the images show would be cut away, and not {before:.0%}"
             text += "; choose another --projection, or raise --max-stretch"
             upright, messages = None, [Message(text, code="not-straightened")]

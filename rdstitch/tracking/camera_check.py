@@ -3,7 +3,8 @@
 import math
 from dataclasses import dataclass
 
-from rdstitch.alignment.given_checks import LATE, attitudes_late, focal_contradicted, judged_focal
+from rdstitch.alignment.given_checks import LATE, judged_focal
+from rdstitch.alignment.sentences import attitudes_late, focal_contradicted
 from rdstitch.results.messages import Message
 from rdstitch.tracking.camera_from_motion import CameraEstimate, SeenPairs, camera_from_motion
 from rdstitch.tracking.frame_links import MATCH_ERROR

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -30,33 +30,31 @@ _PATIENCE = 0.015  # seconds a frame that are waited for the first alignment
 _KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below which it becomes a keyframe
 
 
-@dataclass(frozen=True)
-class TrackingOptions:
-    """Choices and knowledge of a tracker."""
-
-    pair: EstimationOptions = field(default_factory=EstimationOptions)  # with λ, where it is known
-    # with the λ of the cameras if ``pair`` has one
-    alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
-    # whether alignments are waited for: the same frames give the same poses; else no frame waits long
-    patient: bool = True
-
-
 class FrameTracker:
     """Registers frames of one camera one after the other.
 
     Features (``detect``, in a frame's pixels; ``match``) are asked for only where the corners of the last keyframe,
-    followed from frame to frame, do not place a frame. Keyframes are aligned by ``executor`` while further frames come.
+    followed from frame to frame, do not place a frame. Keyframes are aligned by ``executor`` while further frames come;
+    where a tracker is ``patient`` these are waited for, so that the same frames give the same poses, else no frame
+    waits long. Where λ is known both options have it.
     """
 
     def __init__(
-        self, options: TrackingOptions, detect: Callable[[PreparedImage], Features], match: Matcher, executor: Executor
+        self,
+        pair: EstimationOptions,
+        alignment: AlignmentOptions,
+        detect: Callable[[PreparedImage], Features],
+        match: Matcher,
+        executor: Executor,
+        *,
+        patient: bool = True,
     ) -> None:
         self._detect, self._match, self._count = detect, match, 0
         self.messages: list[Message] = []  # what the user should know of what has come so far
-        self._knowledge = CameraKnowledge.of(options.alignment, options.pair)
+        self._knowledge = CameraKnowledge.of(alignment, pair)
         self._flow, self._odometry = CornerFlow(), OdometryPrediction()
         self._map = KeyframeMap(self._knowledge, [])
-        self._refinement = MapRefinement(executor, patient=options.patient, report=self._report)
+        self._refinement = MapRefinement(executor, patient=patient, report=self._report)
 
     @property
     def revisable(self) -> set[int]:

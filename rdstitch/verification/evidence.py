@@ -42,6 +42,11 @@ class ResultEvidence:
         """The links that the alignment uses."""
         return [fit for fit in self.alignment.links if fit.used]
 
+    @property
+    def worst(self) -> LinkFit:
+        """The link with the largest errors."""
+        return max(self.used, key=lambda fit: fit.rms)
+
     @cached_property
     def _images(self) -> ComparedImages:
         return ComparedImages(self.registration.sources, self.registration.stretch, self.threads)
@@ -62,7 +67,7 @@ class ResultEvidence:
         """Whether what an image, or a pair, or all of them if empty, has in common with others is clearly alike."""
         links = [link for link in self.checked if len({*images} & {*link.pair}) == len(images)]
         cells = sum(link.agreement.cells for link in links)
-        return cells >= Limits.min_cells.value and share_alike(links) >= Limits.min_alike_fraction.value
+        return cells >= Limits.min_cells and share_alike(links) >= Limits.min_alike_fraction
 
     def explained_by_depth(self, images: Sequence[int]) -> bool:
         """Whether matches of a picture disagree where its images look alike: it has depth, or something moved."""
@@ -71,7 +76,7 @@ class ResultEvidence:
     @cached_property
     def alike_fraction(self) -> float:
         """How much alike images look where most pairs put them, [0, 1]; 0 where there is nothing to see."""
-        shares = [link.agreement.share for link in self.checked if link.agreement.cells >= Limits.min_cells.value]
+        shares = [link.agreement.share for link in self.checked if link.agreement.cells >= Limits.min_cells]
         return float(np.median(shares)) if shares else 0.0
 
     @property

@@ -1,14 +1,19 @@
 """The thresholds that results are judged by, with units and what set each: a measurement, or "unmeasured"."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 
-class Limit(NamedTuple):
-    """A threshold."""
+@dataclass(frozen=True)
+class Limit:
+    """A threshold; as an attribute of a class its value."""
 
     value: float
     unit: str
     source: str
+
+    def __get__(self, instance: object, owner: type) -> float:
+        """The value."""
+        return self.value
 
 
 class Limits:

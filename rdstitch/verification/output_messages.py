@@ -31,7 +31,7 @@ def cut_away_messages(placed: PlacedImages, canvas: Canvas, options: CompositeOp
     text = f"{share:.0%} of what the images show is cut away: it would be stretched over {options.max_stretch:g} times"
     if placed.turned and canvas.projection == PLANE:
         text += "; --projection cylinder or sphere shows more"
-    return [Message(text, severity="note")] if share > Limits.visible_cut.value else []
+    return [Message(text, severity="note")] if share > Limits.visible_cut else []
 
 
 def place_messages(place: Georeference | None, reason: str, placed: PlacedImages) -> list[Message]:

@@ -121,7 +121,7 @@ def share_alike(checked: Sequence[CheckedLink]) -> float:
 
 def wrong_at_most(checked: Sequence[CheckedLink]) -> float:
     """Share of all links that may look unlike, by those taken at random (Wilson's upper bound, 95 %); 1 without any."""
-    cells, unlike = Limits.min_cells.value, Limits.max_unlike_fraction.value
+    cells, unlike = Limits.min_cells, Limits.max_unlike_fraction
     sampled = [link.agreement for link in checked if link.sampled and link.agreement.cells >= cells]
     if not sampled:
         return 1.0

@@ -7,7 +7,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from examples.worlds.alignment_scenes import aligned, fitted, grid, scene
+from examples.worlds.alignment_scenes import aligned, fitted, grid, grid_scene, scene
 from examples.worlds.turns import camera_rotations
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Problem
@@ -95,9 +95,7 @@ def test_a_wide_lens_on_a_turn_is_found() -> None:
 
 @pytest.mark.parametrize("tilt", [0.0, 0.6])
 def test_a_camera_that_moves_over_a_plane_does_not_turn(tilt: float) -> None:
-    rng = np.random.default_rng(4)
-    poses = grid(3, 2, (0.4, 0.35), 0.3, rng)
-    given = scene(poses, rng=rng, tilt=(tilt, 0.0), focal_source="guess", per_link=120)
+    given = grid_scene(3, 2, (0.4, 0.35), 0.3, seed=4, tilt=(tilt, 0.0), focal_source="guess", per_link=120)
     found = aligned(given)
     assert found.model == "rigid"
     assert found.tilt[0] == pytest.approx(tilt, abs=0.03)

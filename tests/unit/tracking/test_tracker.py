@@ -17,12 +17,12 @@ from examples.worlds.paths import drive_poses
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.features import FeatureOptions, Features, detect, match
-from rdstitch.features.corner_flow import CornerFlow, corners_of, fitted_affine, matched_corners
+from rdstitch.features.corner_flow import CornerFlow, corners_of, matched_corners
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
+from rdstitch.inputs.keyframes import fitted_affine
 from rdstitch.inputs.odometry import BodyPose
-from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, blank, sequence_over
 from rdstitch.tracking import (
@@ -30,9 +30,7 @@ from rdstitch.tracking import (
     Placement,
     PlaneSimilarity,
     Preview,
-    TrackingOptions,
     TrackingResult,
-    map_refinement,
 )
 from rdstitch.tracking.camera_check import CameraRevision, revise_camera
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
@@ -80,8 +78,8 @@ def _blank(features: Features) -> PreparedImage:
 def _tracker(
     distortion: float | None = None, detector: Callable[[PreparedImage], Features] = MADE_UP.__getitem__
 ) -> FrameTracker:
-    options = TrackingOptions(EstimationOptions(distortion=distortion, select_below=50))
-    return FrameTracker(options, detector, partial(match, ratio=0.8), ThreadPoolExecutor(1))
+    options = EstimationOptions(distortion=distortion, select_below=50)
+    return FrameTracker(options, AlignmentOptions(), detector, partial(match, ratio=0.8), ThreadPoolExecutor(1))
 
 
 def _path(results: list[TrackingResult]) -> Trajectory:
@@ -353,21 +351,6 @@ def test_an_alignment_that_is_dropped_keeps_no_worker_busy() -> None:
         refinement.drop()
         go_on.set()
     assert future.cancelled()
-
-
-def test_an_alignment_that_fails_does_not_end_the_track(monkeypatch: pytest.MonkeyPatch) -> None:
-    def singular(*_: object) -> None:
-        raise RuntimeError("Factor is exactly singular")
-
-    monkeypatch.setattr(map_refinement, "align", singular)
-    said: list[Message] = []
-    keyframe_map = KeyframeMap(_given_camera(), [_keyframe(0), _keyframe(1)], has_plane=True)
-    with ThreadPoolExecutor(1) as executor:
-        refinement = MapRefinement(executor, patient=True, report=said.append)
-        refinement.begin(keyframe_map)
-        assert refinement.take_over(keyframe_map, None) == []
-        refinement.begin(keyframe_map)
-    assert "exactly singular" in said[0].text
 
 
 @pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0, 1.0), (1.5, -2.0, 2.5, 0.8), (-3.0, 0.2, -3.0, 1.4)])

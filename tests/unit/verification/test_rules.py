@@ -40,6 +40,7 @@ def _depth(alike: float, purpose: Purpose = Purpose.TRAJECTORY, size: float = 0.
         (_depth(0.1, model="rotation"), [Kind.DEPTH_OF_A_TURN]),
         (_depth(0.8), [Kind.RELIEF]),
         (_depth(0.8, parameters=()), [Kind.FREE_HOMOGRAPHIES]),  # one line: the plane may be none
+        (_depth(0.8, Purpose.CALIBRATE, parameters=()), [Kind.RELIEF]),  # of a lens nothing adds up
         (_depth(0.1, Purpose.MOSAIC, model="rotation", rms=4.0), []),
         # What local alignment hides along the seams of a plane leaves the whole bent.
         (_depth(0.8, Purpose.MOSAIC, rms=4.0), [Kind.ROUGH]),
