@@ -16,6 +16,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
+from rdstitch.matching.links import Link
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +99,15 @@ class AlignmentOptions:
         inexact = measured and not exact
         without = {"rigid": inexact, "similarity": inexact, "tilting": exact, "pose": measured}
         return [name for name in MODELS if not without.get(name, False)]
+
+
+@dataclass(frozen=True, eq=False)
+class GivenImages:
+    """Images to be aligned."""
+
+    cameras: Sequence[Camera]
+    links: Sequence[Link]
+    options: AlignmentOptions
 
 
 def _of_images(name: str, given: ArrayLike | None, shape: tuple[int, ...], missing: float = math.nan) -> FloatArray:

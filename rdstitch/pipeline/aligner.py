@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, GivenImages, most_matches_read
+from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
 from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.choices import Purpose
@@ -99,7 +99,7 @@ class Aligner:
         tilts = self.options.exact_tilts(len(self.cameras))
         if not tilts:
             return tilts
-        return [(psi, theta) for psi, theta in self._quarters.upright_tilts(np.array(tilts)).tolist()]
+        return [(psi, theta) for psi, theta in self._quarters.tilts(np.array(tilts)).tolist()]
 
     def align(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
         """Align the images by the pairs that were registered; from an earlier run where the cache has it."""
@@ -112,7 +112,7 @@ class Aligner:
         ground = over_rough_ground(pairs, self.threshold)
         if ground is not pairs and not self._explains(aligned.alignment, pairs, ground):
             over = self._drafted(ground)
-            if over.alignment.rms <= Limits.max_rough_rms.value * self.threshold:  # else it is not one ground
+            if over.alignment.rms <= Limits.max_rough_rms * self.threshold:  # else it is not one ground
                 aligned = replace(over, pairs=tuple(pairs), rough=True)
         return self.metric(aligned) if self.needs_poses else aligned
 
@@ -148,16 +148,16 @@ class Aligner:
         if not related:  # all images show the same
             copies = {}
             related = distinct(pairs, copies)
-        most, quarters = most_matches_read(len(related), self.options), self._quarters
-        cameras = tuple(quarters.stored_camera(camera, k) for k, camera in enumerate(self.cameras))
+        most, stored = most_matches_read(len(related), self.options), self._quarters.back
+        cameras = tuple(stored.camera(camera, k) for k, camera in enumerate(self.cameras))
         named = (replace(pair.link().thinned(most), image1=i, image2=j) for (i, j), pair in related.items())
-        links = tuple(quarters.stored_link(link, self.cameras) for link in named)
+        links = tuple(stored.link(link, self.cameras) for link in named)
         if (size := common_size(cameras, links)) is not None:
             cameras = tuple(framed_camera(camera, size) for camera in cameras)
             links = tuple(framed_link(link, size) for link in links)
         reference = self.options.reference
         options = replace(self.options, reference=None if reference is None else copies.get(reference, reference))
-        task = AlignmentTask(GivenImages(cameras, links, options))
+        task = AlignmentTask(cameras, links, options)
         ends = [pair.images for pair in related.values()]
 
         def complete(stage: str, compute: Callable[[], Alignment]) -> Alignment:
@@ -177,13 +177,12 @@ class Aligner:
 
     def _recalled(self, stage: str, task: AlignmentTask, compute: Callable[[], Alignment]) -> Alignment:
         """An alignment of the upright images; from an earlier run where the cache has it."""
-        given = task.given
-        inputs = (given.cameras, self.cache.digest(given.links), given.options)
+        inputs = (task.cameras, self.cache.digest(task.links), task.options)
         alignment = self.cache.recall(stage, inputs, compute)
-        sizes = [self._quarters.stored_camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
+        sizes = [self._quarters.back.camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
         if any(camera.image_size != size for camera, size in zip(alignment.cameras, sizes, strict=True)):
             alignment = cut_alignment(alignment, sizes)
-        return self._quarters.upright_alignment(alignment, given.options.gravity)
+        return self._quarters.alignment(alignment, task.options.gravity)
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
         """A draft of the same pairs by a model with metric poses, where the user left the choice of the model open."""

@@ -53,7 +53,7 @@ class MapRefinement:
     def start_map(self) -> None:
         """Forget what belongs to the last map."""
         self._next = _FIRST
-        self._taken_over_at = 0  # keyframes seen from which on the alignment is
+        self._taken_over_at = 0  # keyframes after the first from which on the alignment is
         self.drop()
 
     def drop(self) -> None:
@@ -64,21 +64,19 @@ class MapRefinement:
 
     def begin_if_due(self, keyframe_map: KeyframeMap) -> None:
         """Begin the next alignment of a map to which a keyframe was added, if it is time for it."""
-        if keyframe_map.seen + 1 < self._next or self._window is not None:
+        if keyframe_map.added + 1 < self._next or self._window is not None:
             return
         lens_known = keyframe_map.knowledge.distortion_known
         grown = max(2, round(self._next * (_GROWTH - 1.0)))
         self._next += _INTERVAL if lens_known else min(grown, _INTERVAL)
         # At a keyframe and not when it is done: so that time does not decide on the result.
-        self._taken_over_at = keyframe_map.seen + (
-            _DELAY if lens_known and keyframe_map.state.has_plane else _FIRST_DELAY
-        )
+        self._taken_over_at = keyframe_map.added + (_DELAY if lens_known and keyframe_map.has_plane else _FIRST_DELAY)
         self.begin(keyframe_map)
 
     def begin(self, keyframe_map: KeyframeMap) -> None:
         """Begin to align the last keyframes among themselves."""
         window, knowledge, keeps_focal = list(keyframe_map.keyframes), keyframe_map.knowledge, keyframe_map.keeps_focal
-        executor = self._executor if keyframe_map.state.has_plane else self._first_executor
+        executor = self._executor if keyframe_map.has_plane else self._first_executor
         frames = [keyframe.frame for keyframe in window]
         options = replace(knowledge.options_for(frames), max_matches_per_link=_MATCHES, reference=None)
         cameras = knowledge.cameras_for(frames, _EXACT if keeps_focal else None)
@@ -94,7 +92,7 @@ class MapRefinement:
         window = self._window
         if window is None or (alignment := self._finished(window, patience)) is None:
             return []
-        waiting = {number for number, frame in keyframe_map.frames.items() if not frame.place.aligned}
+        waiting = {number for number, frame in keyframe_map.frames.items() if not frame.aligned}
         placements, length_factor = _on_map(keyframe_map, window, alignment)
         keyframe_map.align(placements)
         knowledge, frames = keyframe_map.knowledge, [keyframe.frame for keyframe in window.keyframes]
@@ -123,9 +121,9 @@ class MapRefinement:
             return None
         return alignment
 
-    def is_waited_for(self, seen: int) -> bool:
-        """Whether the alignment is taken over when so many keyframes have been seen."""
-        return self.patient and seen >= self._taken_over_at
+    def is_waited_for(self, added: int) -> bool:
+        """Whether the alignment is taken over when so many keyframes were added to the first."""
+        return self.patient and added >= self._taken_over_at
 
 
 def _on_map(keyframe_map: KeyframeMap, window: _Window, alignment: Alignment) -> tuple[dict[int, Placement], float]:
@@ -134,7 +132,8 @@ def _on_map(keyframe_map: KeyframeMap, window: _Window, alignment: Alignment) ->
     placed = [(keyframe, Placement(camera, h, alignment.focal)) for keyframe, camera, h, used in aligned if used]
     move, length_factor = _to_map(placed)
     first, placement = placed[0]
-    if keyframe_map.whole and first.number == keyframe_map.keyframes[0].number and (pose := placement.pose) is not None:
+    is_first = not keyframe_map.older and first.number == keyframe_map.keyframes[0].number
+    if is_first and (pose := placement.pose) is not None:
         move = PlaneSimilarity.to_origin(pose)  # the others are relative to it
     return {keyframe.number: move.applied(placement) for keyframe, placement in placed}, length_factor
 
@@ -145,7 +144,7 @@ def _to_map(placed: Sequence[tuple[TrackedFrame, Placement]]) -> tuple[PlaneSimi
     The unit of lengths is the height of the first keyframe: heights stay as they are, whatever focal length they are
     computed by.
     """
-    shared = [(new, keyframe.place.placement) for keyframe, new in placed if keyframe.place.aligned]
+    shared = [(new, keyframe.placement) for keyframe, new in placed if keyframe.aligned]
     if not shared:
         pose = placed[0][1].pose
         return PlaneSimilarity(1.0, 0.0) if pose is None else PlaneSimilarity.to_origin(pose), 1.0

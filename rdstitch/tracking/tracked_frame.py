@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +18,7 @@ from rdstitch.tracking.placement import CameraPose, Placement
 
 MIN_INLIERS = 15
 _GRID = 8  # points a side by which it is measured how much two frames share
-_NO_IMAGE = prepare(View(np.zeros((1, 1), np.uint8)), None)  # of frames that are not looked at again
+NO_IMAGE = prepare(View(np.zeros((1, 1), np.uint8)), None)  # of frames that are not looked at again
 
 
 @dataclass(frozen=True)
@@ -79,20 +79,18 @@ class Frame:
         """Whether it shows enough to be placed by."""
         return len(self.corners) >= MIN_INLIERS or len(self.features) >= MIN_INLIERS
 
-    def without_image(self) -> "Frame":
-        """The same where its image is not looked at again."""
-        return replace(self, image=_NO_IMAGE)
 
+@dataclass(eq=False)
+class TrackedFrame:
+    """A frame with its place relative to the keyframes, which its map may revise."""
 
-@dataclass(frozen=True, eq=False)
-class FramePlace:
-    """Where a frame lies relative to the keyframes."""
-
+    frame: Frame
     placement: Placement
     aligned: bool = False  # whether that is on the plane of the map
     covariance: FloatArray | None = None  # (4, 4): of x, y, height and yaw; None: not known
     inliers: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))  # of the matches that it is by
     predicted: bool = False  # by odometry: images have not measured it
+    keyframe: bool = False
 
     @property
     def quality(self) -> float:
@@ -104,14 +102,10 @@ class FramePlace:
         """Pose of the camera on the map."""
         return self.placement.pose if self.aligned else None
 
-
-@dataclass(eq=False)
-class TrackedFrame:
-    """A frame with its place, which its map may revise."""
-
-    frame: Frame
-    place: FramePlace
-    keyframe: bool = False
+    def move_to(self, other: "TrackedFrame") -> None:
+        """Take the place of the same frame where it was placed again."""
+        self.placement, self.aligned, self.covariance = other.placement, other.aligned, other.covariance
+        self.inliers, self.predicted = other.inliers, other.predicted
 
     @property
     def number(self) -> int:
@@ -120,8 +114,8 @@ class TrackedFrame:
 
     def points_in(self, other: "TrackedFrame", points: FloatArray) -> FloatArray:
         """Where another frame shows points (N, 2) of this one, by the places of both."""
-        there = other.place.placement
-        return from_plane(there.camera, there.homography, self.place.placement.to_plane(points))
+        there = other.placement
+        return from_plane(there.camera, there.homography, self.placement.to_plane(points))
 
     def share_shown_by(self, other: "TrackedFrame") -> float:
         """Share of the frame that another one shows."""

@@ -1,17 +1,17 @@
-"""What the user should know of an output: what is cut away, broken seams, colour profiles."""
+"""What the user should know of an output: its place, what is cut away, broken seams, colour profiles."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from rdstitch.compositing import Canvas, CompositeOptions, SeamQuality
 from rdstitch.compositing.projection import PLANE
+from rdstitch.export.georeference import Georeference, check_summary, map_summary
 from rdstitch.inputs.source import Source
 from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.results.messages import MAX_NAMED, Message, names_of, shortened
 from rdstitch.results.placed_images import PlacedImages
-
-_VISIBLE_CUT = 0.02  # share of the images that is cut away, from which on a note says so
+from rdstitch.verification.limits import Limits
 
 
 def masked_messages(placed: PlacedImages) -> list[Message]:
@@ -31,7 +31,31 @@ def cut_away_messages(placed: PlacedImages, canvas: Canvas, options: CompositeOp
     text = f"{share:.0%} of what the images show is cut away: it would be stretched over {options.max_stretch:g} times"
     if placed.turned and canvas.projection == PLANE:
         text += "; --projection cylinder or sphere shows more"
-    return [Message(text, severity="note")] if share > _VISIBLE_CUT else []
+    return [Message(text, severity="note")] if share > Limits.visible_cut else []
+
+
+def place_messages(place: Georeference | None, reason: str, placed: PlacedImages) -> list[Message]:
+    """What the user should know of the place; nothing where hardly an image has a position."""
+    lost = [source for source in placed.sources if source.metadata.gps_problem]
+    messages = [
+        Message(f"{each.metadata.gps_problem}, and was not used; give --positions", (str(each.path),)) for each in lost
+    ]
+    if place is None:
+        known = reason and placed.has_place
+        return [*messages, Message(f"not georeferenced: {reason}")] if known else messages
+    messages += [Message(reason)] if reason else []
+    messages.append(Message(map_summary(place), severity="note"))
+    if place.assumption:
+        messages.append(Message(place.assumption))
+    if place.checks:
+        messages.append(Message(check_summary(place), severity="note"))
+    if place.rejected:
+        names = [name for name, _ in place.rejected]
+        more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+        off = max(away for _, away in place.rejected)
+        text = f"{place.source} that the images contradict, by up to {off:.3g} m, were not used: "
+        messages.append(Message(f"{text}{', '.join(names[:MAX_NAMED])}{more}"))
+    return messages
 
 
 def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
