@@ -20,6 +20,10 @@ class GivenImages:
     cameras: Sequence[Camera]
     links: Sequence[Link]
     options: AlignmentOptions
+    # Images that show next to nothing but what another one does, each with that one, and their links: they are placed
+    # by these when all the rest is known
+    near_copies: Mapping[int, int] = field(default_factory=dict)
+    links_of_copies: Sequence[Link] = ()
 
 
 @dataclass(frozen=True, eq=False)
