@@ -97,10 +97,9 @@ def _with_near_copies(alignment: Alignment, adjustment: AdjustedImages) -> Align
     )
     every = replace(
         adjustment,
-        given=replace(given, links=given.links_of_copies, options=replace(given.options, pose_covariance=False)),
+        given=replace(given, options=replace(given.options, pose_covariance=False)),
         images=images,
-        kept_links=np.ones(len(given.links_of_copies), dtype=np.bool_),
-        problem=replace(problem, observations=adjuster.observations, fixed=int(number[alignment.reference])),
+        problem=replace(problem, fixed=int(number[alignment.reference])),
         choice=replace(adjustment.choice, fit=replace(fit, adjusted=adjuster.run(start))),
     )
     homographies, poses = _in_frame_of_reference(every)
@@ -108,8 +107,7 @@ def _with_near_copies(alignment: Alignment, adjustment: AdjustedImages) -> Align
     if poses is not None and result.poses is not None:
         known = result.poses  # how well a copy is known is how well its image is
         poses = replace(poses, covariance=known.covariance, with_first=known.with_first)
-    links_of_copies = _link_fits(every, _Agreement.of(every))
-    return replace(result, homographies=homographies, poses=poses, links=(*result.links, *links_of_copies))
+    return replace(result, homographies=homographies, poses=poses)
 
 
 @dataclass(frozen=True, eq=False)

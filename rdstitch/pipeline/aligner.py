@@ -148,12 +148,12 @@ class Aligner:
         if not related:  # all images show the same
             copies = {}
             related = distinct(pairs, copies)
-        near = near_copies_of(related)
-        near.pop(-1 if self.options.reference is None else self.options.reference, None)
+        reference = self.options.reference
+        near = {copy: first for copy, first in near_copies_of(related).items() if copy != reference}
         evidence = [ends for ends in related if not near.keys() & {*ends}]
         if not evidence:
             near, evidence = {}, [*related]
-        ends = [*evidence, *(pair for pair in related if near.keys() & {*pair})]
+        ends = [*evidence, *(ends for ends in related if near.keys() & {*ends})]
         most, quarters = most_matches_read(len(evidence), self.options), self._quarters
         cameras = tuple(quarters.stored_camera(camera, k) for k, camera in enumerate(self.cameras))
         named = (replace(related[i, j].link().thinned(most), image1=i, image2=j) for i, j in ends)
@@ -161,10 +161,9 @@ class Aligner:
         if (size := common_size(cameras, links)) is not None:
             cameras = tuple(framed_camera(camera, size) for camera in cameras)
             links = tuple(framed_link(link, size) for link in links)
-        reference = self.options.reference
         options = replace(self.options, reference=None if reference is None else copies.get(reference, reference))
         task = AlignmentTask(GivenImages(cameras, links[: len(evidence)], options, near, links[len(evidence) :]))
-        compared, twice = [related[pair].images for pair in ends], copies | near
+        compared, twice = [related[pair].images for pair in evidence], copies | near
 
         def complete(stage: str, compute: Callable[[], Alignment]) -> Alignment:
             alignment = self._recalled(stage, task, compute)
