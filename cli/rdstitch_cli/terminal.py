@@ -79,18 +79,15 @@ class Reporter:
 
     def warn(self, text: str) -> None:
         """Say what the user should know even though the command succeeds."""
-        if self._verbosity >= 0:
-            self._line(f"rdstitch: warning: {text}")
+        self._line(f"rdstitch: warning: {text}", 0)
 
     def note(self, text: str) -> None:
         """Say what belongs to the result but not to standard output."""
-        if self._verbosity >= 0:
-            self._line(f"rdstitch: {text}")
+        self._line(f"rdstitch: {text}", 0)
 
     def log(self, text: str) -> None:
         """Log what is going on, under ``-v``."""
-        if self._verbosity >= 1:
-            self._line(f"rdstitch: {text}")
+        self._line(f"rdstitch: {text}", 1)
 
     def tell(self, message: "Message") -> None:
         """Say a message as loudly as it is grave."""
@@ -117,8 +114,7 @@ class Reporter:
     def made(self, text: str) -> None:
         """End by saying what was made, and how long it took."""
         self._end_stage()
-        if self._verbosity >= 0:
-            self._line(f"{text}, {time.perf_counter() - self._began:.1f} s")
+        self._line(f"{text}, {time.perf_counter() - self._began:.1f} s", 0)
 
     def __enter__(self) -> Self:
         return self
@@ -127,8 +123,10 @@ class Reporter:
         """Take the bar away, whatever happened."""
         self.finish()
 
-    def _line(self, text: str) -> None:
-        """Print a line; where nobody reads standard error any more, the work goes on without."""
+    def _line(self, text: str, verbosity: int) -> None:
+        """Print a line from a verbosity on; where nobody reads standard error any more, the work goes on without."""
+        if self._verbosity < verbosity:
+            return
         with suppress(OSError):
             if self._bar is not None:
                 self._bar.clear()

@@ -1,6 +1,7 @@
 """Links synthesised from known poses, for the tests of the global adjustment."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -102,6 +103,22 @@ def scene(
     return Scene(cameras, links, truth, poses, distortion)
 
 
+def grid_scene(
+    columns: int,
+    rows: int,
+    step: tuple[float, float] = (0.4, 0.3),
+    yaw: float = 0.2,
+    *,
+    wind: tuple[float, float] = (0.0, 0.0),
+    seed: int,
+    **options: Any,
+) -> Scene:
+    """A :func:`scene` over a :func:`grid`, by ``wind`` :func:`jittered`, by one generator of random numbers."""
+    rng = np.random.default_rng(seed)
+    poses = grid(columns, rows, step, yaw, rng)
+    return scene(jittered(poses, *wind, rng) if any(wind) else poses, rng=rng, **options)
+
+
 def _seen(inverse: FloatArray, lens: Camera, pixels: FloatArray) -> FloatArray:
     """Points of the plane (n, 2) at some measured pixels."""
     undistorted = lens.normalize(lens.undistort(pixels))
@@ -152,5 +169,5 @@ def fitted(given: Scene) -> tuple[Problem, Fit]:
     free = np.arange(5) == 0
     trust = np.ones(len(given.links))
     lens = np.array([given.distortion, 0.0, 0.0, 0.0, 0.0])
-    problem = Problem(observations, homographies, trust, count, 0, lens, free, known)
+    problem = Problem(observations, homographies, lens, free, known, trust=trust, count=count, fixed=0)
     return problem, fit_model(problem, SIMILARITY)

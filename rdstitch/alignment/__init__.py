@@ -1,6 +1,5 @@
 """From pairs of images to all of them registered as one."""
 
-from rdstitch.alignment.adjusted_images import GivenImages
 from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.lens.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
@@ -14,7 +13,6 @@ __all__ = [
     "Alignment",
     "AlignmentOptions",
     "AlignmentTask",
-    "GivenImages",
     "Link",
     "align",
     "most_matches_read",

@@ -4,6 +4,7 @@ import itertools
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -52,17 +53,28 @@ class _Scales:
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
-    """Connected images to be aligned."""
+class LinkProblem:
+    """Links to be adjusted, each on its own, with a lens in common."""
 
     observations: Observations  # links between the images 0 … N-1
     homographies: FloatArray  # (L, 3, 3): of the links, at the ``lens``
-    trust: FloatArray  # (L,): how much each link can be relied on to start with
-    count: int  # N
-    fixed: int | None  # the image that fixes the gauge; None: part chooses one
     lens: FloatArray  # (5,): where to start
     free_lens: BoolArray  # (5,)
     camera_priors: CameraPriors
+
+    def at(self, adjusted: BundleAdjustmentResult, free_lens: BoolArray) -> Self:
+        """The same from where an adjustment has put links and lens, with so much of the lens free."""
+        lens = adjusted.parameters.lens
+        return replace(self, homographies=adjusted.homographies, lens=lens, free_lens=free_lens)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Problem(LinkProblem):
+    """Connected images to be aligned."""
+
+    trust: FloatArray  # (L,): how much each link can be relied on to start with
+    count: int  # N
+    fixed: int | None  # the image that fixes the gauge; None: part chooses one
     overdispersion: float = 1.0  # overdispersion, min_gain: see BundleAdjuster
     min_gain: float = MIN_GAIN
 
@@ -72,7 +84,7 @@ class Problem:
         assert self.fixed is not None, "only a part of a problem has a reference"
         return self.fixed
 
-    def part(self, kept: BoolArray, images: IntArray | None = None) -> tuple["Problem", IntArray]:
+    def part(self, kept: BoolArray, images: IntArray | None = None) -> tuple[Self, IntArray]:
         """The problem of some links (L,) between these images, or the largest group that they connect; and the images.
 
         Without a reference among them the centre of their match graph is it.

@@ -1,8 +1,8 @@
 """What the caller of the alignment decides, and what is given of the camera and the images."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import get_args
 
 import numpy as np
@@ -16,6 +16,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
+from rdstitch.matching.links import Link
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +99,19 @@ class AlignmentOptions:
         inexact = measured and not exact
         without = {"rigid": inexact, "similarity": inexact, "tilting": exact, "pose": measured}
         return [name for name in MODELS if not without.get(name, False)]
+
+
+@dataclass(frozen=True, eq=False)
+class GivenImages:
+    """Images to be aligned."""
+
+    cameras: Sequence[Camera]
+    links: Sequence[Link]
+    options: AlignmentOptions
+    # Images that show next to nothing but what another one does, each with that one, and their links: they are placed
+    # by these when all the rest is known
+    near_copies: Mapping[int, int] = field(default_factory=dict)
+    links_of_copies: Sequence[Link] = ()
 
 
 def _of_images(name: str, given: ArrayLike | None, shape: tuple[int, ...], missing: float = math.nan) -> FloatArray:

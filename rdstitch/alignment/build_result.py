@@ -1,32 +1,41 @@
 """From the adjusted parameters to the :class:`Alignment`: frames, poses, uncertainties, and what was left out."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.adjusted_images import AdjustedImages
+from rdstitch.alignment.adjustment_problem import Problem
+from rdstitch.alignment.alignment_options import GivenImages
 from rdstitch.alignment.frames.level_frame import levelled
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, FreeParameters
 from rdstitch.alignment.least_squares.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.lens.lens_description import radius_std
-from rdstitch.alignment.lens.lens_selection import CENTER, ENOUGH_IMAGES
-from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, MotionModel, X, Y
-from rdstitch.alignment.noise import COHERENT_CORRELATION, Coherence, coherence, shows_relief
+from rdstitch.alignment.lens.lens_selection import CENTER, ENOUGH_IMAGES, LensChoice
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
+from rdstitch.alignment.noise import coherence
 from rdstitch.alignment.result import Alignment, LinkFit, PlanarPoses, ReliefTest, Unused
+from rdstitch.alignment.select import ModelChoice
+from rdstitch.alignment.sentences import (
+    few_images,
+    focal_overruled,
+    lens_not_observable,
+    not_converged,
+    relief_test,
+)
 from rdstitch.alignment.uncertainty import considered_covariance, lever_std, pose_covariances
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ImpossibleCameraError
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.geometry.division_model import nearest_one_parameter
 from rdstitch.geometry.planar_motion import rigid_in_plane
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.matching.match_graph import connected_components
-from rdstitch.results.messages import Message, Severity
+from rdstitch.results.messages import Message
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
 from rdstitch.robust.posterior import MODEL_ERROR, exact
 
@@ -35,6 +44,25 @@ _RADII = np.linspace(0.05, 1.0, 20)  # half diagonals: where the lens is looked 
 _OVERRULED = 1.5  # ratio from which on EXIF was wrong, not rounded or of another focus
 _WORTH_SAYING = 1.0  # pixels that the corners of too few images may lie elsewhere, from which on that is said
 _CONFIDENT = 2.0  # standard deviations within which the lens is taken to be known: 95 %
+
+
+@dataclass(frozen=True, eq=False)
+class AdjustedImages:
+    """What the adjustment found, and what it was made from."""
+
+    given: GivenImages
+    images: IntArray  # (N,): the images aligned, ascending; the problem numbers them 0 … N-1
+    kept_links: BoolArray  # (L,): links not taken for wrong
+    all_links: Problem  # of all links and images, with the matches that they are adjusted by in the end
+    problem: Problem  # of those aligned, with the matches that they were adjusted by
+    choice: ModelChoice
+    lens: LensChoice  # the lens, with the distortion centre if the motion model freed it
+    positions_disagree: str = ""  # why the positions were not used; empty where they were, or where there are none
+    leverage: Mapping[int | str, float] = field(default_factory=dict)  # see Alignment
+    messages: tuple[Message, ...] = ()  # on what was given
+    # covariance, lens_covariance: of what was estimated, and of all parameters of a lens; none of a draft
+    covariance: FloatArray | None = None
+    lens_covariance: FloatArray | None = None
 
 
 def build_alignment(adjustment: AdjustedImages) -> Alignment:
@@ -70,7 +98,7 @@ def build_alignment(adjustment: AdjustedImages) -> Alignment:
         relief=agreement.relief,
         leverage=adjustment.leverage,
         lever_std=lever_std(problem, fit) if has_lever else 0.0,
-        messages=(*_warnings(adjustment, cameras[reference], uncertainty.considered), *adjustment.messages),
+        messages=_messages(adjustment, cameras[reference], uncertainty.considered),
     )
     return _with_near_copies(alignment, adjustment) if given.near_copies else alignment
 
@@ -128,7 +156,7 @@ class _Agreement:
         # No lens or plane is exact enough for matches that are off by less to disagree.
         agreeing = squared < (ALIGNMENT_WIDTH * math.hypot(observations.sigma(squared), MODEL_ERROR)) ** 2
         left = coherence(observations, errors, observations.inliers(squared))
-        return cls(squared, agreeing, _relief_test(left, fit.model, len(observations)))
+        return cls(squared, agreeing, relief_test(left, fit.model, len(observations)))
 
     @property
     def rms(self) -> float:
@@ -161,24 +189,6 @@ class _Uncertainty:
     def std(self) -> FloatArray:
         """Standard deviations (P,)."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-
-
-def _relief_test(left: Coherence, model: MotionModel, links: int) -> ReliefTest:
-    """What the agreement of neighbours that a model leaves means for the scene."""
-    found = shows_relief(left)
-    agreement = f"errors of neighbours agree (correlation {left.correlation:.2f}, {left.size:.1f} pixels in common)"
-    if model.on_sphere:
-        moved = "the camera moved between the images (parallax): what is near does not fit; turn about the lens"
-        text = f"{agreement}: {moved}" if found else f"the camera hardly moved (correlation {left.correlation:.2f})"
-    elif found:
-        wrong = f"the scene is not one plane, or the {model.name} model does not describe the camera; λ may be off"
-        text = f"{agreement}: {wrong}"
-    elif left.correlation > COHERENT_CORRELATION:
-        text = f"{agreement}, as over a scene that is nearly flat"
-    else:
-        seen = "the scene is flat" if links > 1 else "no relief shows, but hills as wide as one overlap would not"
-        text = f"errors of neighbours hardly agree (correlation {left.correlation:.2f}): {seen}"
-    return ReliefTest(found, left.correlation, left.size, text)
 
 
 def _adjusted_cameras(adjustment: AdjustedImages, uncertainty: _Uncertainty) -> tuple[Camera, ...]:
@@ -310,45 +320,23 @@ def _link_fits(adjustment: AdjustedImages, agreement: _Agreement) -> tuple[LinkF
     return tuple(result)
 
 
-def _overruled_focal(adjustment: AdjustedImages, camera: Camera) -> str | None:
-    """That the images show another focal length than EXIF says, where they do."""
-    given = adjustment.problem.camera_priors
-    if given.focal_source != "exif" or not adjustment.choice.fit.model.one_camera or camera.focal is None:
-        return None
-    ratio = camera.focal / camera.scale / math.exp(given.log_focal)
-    if abs(math.log(ratio)) < math.log(_OVERRULED):
-        return None
-    times = f"{ratio:.1f} times the one" if ratio > 1.0 else f"1/{1.0 / ratio:.1f} of the one"
-    return f"the images show a focal length that is {times} in EXIF, which was not used; give the right one"
-
-
-def _warnings(adjustment: AdjustedImages, camera: Camera, considered: FloatArray) -> tuple[Message, ...]:
+def _messages(adjustment: AdjustedImages, camera: Camera, considered: FloatArray) -> tuple[Message, ...]:
     """What the user should know of the whole, with the covariance (5, 5) of all parameters of a lens."""
-    result: list[Message] = []
-    # An image can be right whatever the lens is, and a path by what is known of the lens.
-    image_only, severity = adjustment.given.options.purpose.picture, adjustment.given.options.purpose.unknown_lens
-    if adjustment.lens.depth or not adjustment.lens.observable:
-        cause, remedy = "the images hardly move, or only turn about the optical axis", "images that overlap by less"
-        if adjustment.lens.depth:
-            cause, remedy = "what the images show has depth, which looks like a lens in so few of them", "more images"
-        text = f"λ is not observable: {cause}; give λ, a camera file, or {remedy}"
-        grave: Severity = "failure" if adjustment.lens.depth and not image_only else severity
-        result.append(Message(text, severity=grave, code="lambda-not-observable"))
-    elif len(adjustment.images) < ENOUGH_IMAGES and adjustment.problem.free_lens.any():
+    result, lens, known = list[Message](), adjustment.lens, adjustment.problem.camera_priors
+    purpose, fit = adjustment.given.options.purpose, adjustment.choice.fit
+    if lens.depth or not lens.observable:
+        result.append(lens_not_observable(purpose, depth=lens.depth))
+    elif (count := len(adjustment.images)) < ENOUGH_IMAGES and adjustment.problem.free_lens.any():
         every = replace(camera, lens_covariance=tuple(map(tuple, considered.tolist())))
         off = _CONFIDENT * float(radius_std(every, _RADII)[-1])
         if off > _WORTH_SAYING:
-            text = (
-                f"from {len(adjustment.images)} images the lens distortion is known to about {off:.2g} pixels at the "
-                f"corners; {ENOUGH_IMAGES} or more images, or a camera file, make it surer"
-            )
-            result.append(Message(text, severity="detail" if image_only else "warning", code="few-images"))
-    if (overruled := _overruled_focal(adjustment, camera)) is not None:
-        result.append(Message(overruled))
-    if not adjustment.choice.fit.adjusted.converged:
-        text = "the adjustment did not converge, from another start neither, so that λ is not known; add images"
-        # Of seven on adverse sets two results were off (python -m examples.benchmarks.trust --kind adverse).
-        result.append(Message(text, severity=severity, code="not-converged"))
+            result.append(few_images(count, ENOUGH_IMAGES, off, purpose))
+    if known.focal_source == "exif" and fit.model.one_camera and camera.focal is not None:
+        ratio = camera.focal / camera.scale / math.exp(known.log_focal)
+        if abs(math.log(ratio)) >= math.log(_OVERRULED):
+            result.append(focal_overruled(ratio))
+    if not fit.adjusted.converged:
+        result.append(not_converged(purpose))
     if adjustment.positions_disagree:
         result.append(Message(adjustment.positions_disagree))
-    return tuple(result)
+    return (*result, *adjustment.messages)

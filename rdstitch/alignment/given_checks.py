@@ -17,6 +17,13 @@ from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.motion_models import MODELS, POSE, PSI, THETA
 from rdstitch.alignment.select import select_model
+from rdstitch.alignment.sentences import (
+    attitudes_contradicted,
+    attitudes_late,
+    attitudes_scatter,
+    focal_contradicted,
+    tilt_contradicted,
+)
 from rdstitch.alignment.starts import start_from
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.geometry.camera import Camera
@@ -60,16 +67,20 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
         attitudes = at_delay(np.asarray(options.delayed_attitudes), late[0])
         return replace(options, attitudes=attitudes, delayed_attitudes=None), attitudes_late(*late)
     given, stated = known.attitudes + known.tilt, options.attitudes_std if options.attitudes is not None else 0.0
-    found = shown.compared(given)
-    if found.as_given - shown.log_likelihood(given, stated) < _LOG_ODDS or found.scatter <= stated:
+    # The largest log likelihood and its scatter of tilts as given, with other signs or order, and of none.
+    changed = [shown.best_scatter(given @ change.T) for change in _SIGNED_ORDERS]
+    (as_given, scatter), likeliest = changed[0], max(range(len(changed)), key=lambda k: changed[k][0])
+    (as_changed, scatter_changed), (without_any, _) = changed[likeliest], shown.best_scatter(np.zeros_like(given))
+    if as_given - shown.log_likelihood(given, stated) < _LOG_ODDS or scatter <= stated:
         return None
-    if max(found.changed, found.without) >= found.as_given + _LOG_ODDS:
+    if max(as_changed, without_any) >= as_given + _LOG_ODDS:
         if options.attitudes is None:
-            return without, _tilt_contradicted(given[0], shown)
-        return without, _attitudes_contradicted(found)
+            return without, tilt_contradicted(given[0], np.median(shown.tilts, axis=0))
+        change = _SIGNED_ORDERS[likeliest] if as_changed > without_any + _LOG_ODDS else None
+        return without, attitudes_contradicted(scatter, change, max(scatter_changed, _EXACT))
     if options.attitudes is None:
         return None
-    return replace(options, attitudes_std=found.scatter), _attitudes_scatter(found.scatter, stated)
+    return replace(options, attitudes_std=scatter), attitudes_scatter(scatter, stated)
 
 
 def _fit_without_tilts(
@@ -128,57 +139,6 @@ def judged_focal(stated_std: float, shown: float, shown_std: float) -> tuple[flo
     return math.sqrt((1.0 - wrong) * squares[0] + wrong * squares[1]), log_odds > _LOG_ODDS
 
 
-def focal_contradicted(given: float, shown: float, log_std: float) -> Message:
-    """What the user should know where images show another focal length than was given, pixels."""
-    text = f"the images contradict the given focal length of {given:.1f} pixels, which is not used: "
-    return Message(f"{text}they show {shown:.1f} ± {log_std * shown:.1f}", code="focal-contradicted")
-
-
-def attitudes_late(delay: float, std: float) -> Message:
-    """What the user should know of attitudes whose times are so many seconds late."""
-    text = f"the times of the attitudes are {1e3 * delay:.0f} ± {1e3 * std:.0f} ms late, which is allowed for"
-    return Message(text, severity="note", code="attitudes-late")
-
-
-def _attitudes_scatter(scatter: float, stated: float) -> Message:
-    text = f"the attitudes agree with the images to {math.degrees(scatter):.2g} degrees, which is taken for their "
-    return Message(f"{text}standard deviation instead of {math.degrees(stated):.2g}", severity="note")
-
-
-def _tilt_contradicted(given: FloatArray, shown: "_ShownTilts") -> Message:
-    text = "the images contradict the given tilt of {:.2f}, {:.2f} degrees".format(*np.degrees(given))
-    text += ", which is not used: they show {:.2f}, {:.2f}".format(*np.degrees(np.median(shown.tilts, axis=0)))
-    return Message(text, code="attitudes-contradicted")
-
-
-def _attitudes_contradicted(found: "_Comparison") -> Message:
-    text = f"the images contradict the attitudes by {math.degrees(found.scatter):.1f} degrees; they are not used: "
-    error = math.degrees(max(found.scatter_changed, _EXACT))
-    better = f"with {_named(found.change)} they would fit to {error:.2g} degrees"
-    related = found.changed > found.without + _LOG_ODDS
-    text += better if related else "no signs and no order of psi and theta make them fit"
-    return Message(text, code="attitudes-contradicted")
-
-
-def _named(change: FloatArray) -> str:
-    """What is to be changed in a table of attitudes."""
-    psi, theta = ("-psi" if row[0] < 0 else "psi" if row[0] else "-theta" if row[1] < 0 else "theta" for row in change)
-    changes = [f"{new} for {old}" for new, old in ((psi, "psi"), (theta, "theta")) if new != old]
-    return " and ".join(changes)
-
-
-@dataclass(frozen=True, eq=False)
-class _Comparison:
-    """Log likelihoods, each at its best scatter, of tilts as given, with other signs or order, and of none."""
-
-    as_given: float
-    scatter: float  # radians
-    change: FloatArray  # (2, 2): the likeliest of the changes
-    changed: float
-    scatter_changed: float
-    without: float
-
-
 @dataclass(frozen=True, eq=False)
 class _ShownTilts:
     """What the images show of their tilts."""
@@ -216,13 +176,6 @@ class _ShownTilts:
         error = self.axes.T @ (self.tilts - expected[self.images]).ravel()
         variance = self.variances + scatter**2 + _EXACT**2
         return -0.5 * float((error**2 / variance + np.log(variance)).sum())
-
-    def compared(self, given: FloatArray) -> _Comparison:
-        """Tilts (N, 2) that are given, with what they might be instead."""
-        changed = [self.best_scatter(given @ change.T) for change in _SIGNED_ORDERS]
-        best = max(range(len(changed)), key=lambda k: changed[k][0])
-        without, _ = self.best_scatter(np.zeros_like(given))
-        return _Comparison(*changed[0], _SIGNED_ORDERS[best], *changed[best], without)
 
     def best_scatter(self, expected: FloatArray) -> tuple[float, float]:
         """The largest log likelihood of tilts (N, 2), and the scatter that it has."""

@@ -76,6 +76,8 @@ class _KnownPlaces(ABC):
 
     metres: ComplexArray  # (N,): east - i north
     std: FloatArray  # (N,): of a coordinate, m
+    labels: Sequence[int | str]  # (N,): images, or names
+    item: IntArray  # (M,): which of the places each row of the derivatives is of
     min_count: int
     name: str
 
@@ -90,10 +92,6 @@ class _KnownPlaces(ABC):
     @abstractmethod
     def jacobians(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
         """Images (M,), derivatives (M, 2, D + S + K) of places by their poses and the shared parameters, precision."""
-
-    @abstractmethod
-    def labels(self) -> tuple[IntArray, Sequence[int | str]]:
-        """Which of N places each row (M,) of the derivatives is of, and what these are called."""
 
     @property
     def enough(self) -> bool:
@@ -124,6 +122,7 @@ class _Positions(_KnownPlaces):
         self.known = np.isfinite(metres)
         self.metres = metres[self.known]
         self.std = np.where(np.isfinite(std), std, POSITION_STD)[self.known]
+        self.labels, self.item = np.flatnonzero(self.known).tolist(), np.arange(len(self.metres))
 
     def estimated(self, fit: Fit) -> ComplexArray:
         places: ComplexArray = fit.adjusted.parameters.poses[self.known][:, [X, Y]] @ _COMPLEX
@@ -142,10 +141,6 @@ class _Positions(_KnownPlaces):
         derivative[:, [0, 1], axes] = 1.0
         return image, derivative, adjuster.priors.poses_precision[image, axes[0]]
 
-    def labels(self) -> tuple[IntArray, Sequence[int | str]]:
-        names = np.flatnonzero(self.known)
-        return np.arange(len(names)), names.tolist()
-
 
 class _Control(_KnownPlaces):
     min_count, name = _MIN_CONTROL, "ground control points"
@@ -156,17 +151,11 @@ class _Control(_KnownPlaces):
         self.points = known = given.subset(shown)
         self.metres = known.places @ np.array([1.0, -1.0j])
         self.count = np.bincount(known.point, minlength=len(known.names))
-        self.std = known.std
+        self.std, self.labels, self.item = known.std, known.names, known.point
         if len(self.metres) >= self.min_count:
             places = self.estimated(fit)
             pixel = np.bincount(known.point, known.pixel) / self.count
             self.std = np.hypot(known.std, _CLICK * pixel * abs(fit_similarity(places, self.metres, 0.0).scale))
-
-    def marks(self, target: FloatArray, precision: FloatArray) -> PlaneMarks:
-        known = self.points
-        # What a point is off by is the same in all images that show it.
-        shared = (precision / self.count)[known.point]
-        return PlaneMarks(known.image, known.points, target[known.point], shared)
 
     def estimated(self, fit: Fit) -> ComplexArray:
         sums = np.zeros((len(self.metres), 2))
@@ -175,7 +164,10 @@ class _Control(_KnownPlaces):
         return means
 
     def prior(self, known: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
-        return replace(known, marks=self.marks(target, precision))
+        shown = self.points
+        # What a point is off by is the same in all images that show it.
+        shared = (precision / self.count)[shown.point]
+        return replace(known, marks=PlaneMarks(shown.image, shown.points, target[shown.point], shared))
 
     def jacobians(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
         parameters, marks = fit.adjusted.parameters, adjuster.priors.marks
@@ -183,9 +175,6 @@ class _Control(_KnownPlaces):
         focal = fit.model.focal(parameters.shared)
         derivative = marks.equations(fit.adjusted.matrices, parameters.lens, adjuster.free.lens, focal)[1]
         return marks.image, derivative, marks.precision
-
-    def labels(self) -> tuple[IntArray, Sequence[int | str]]:
-        return self.points.point, self.points.names
 
 
 def _sightings(known: ControlPoints, fit: Fit) -> FloatArray:
@@ -229,13 +218,13 @@ def _contradiction(places: _KnownPlaces, similarity: SimilarityFit, growth: floa
 
 
 def _leverage(problem: Problem, fit: Fit, known: Sequence[_KnownPlaces]) -> dict[int | str, float]:
-    """How far (0 to 1) what is known puts itself where the fit has it; see :meth:`_KnownPlaces.labels`."""
+    """How far (0 to 1) what is known puts itself where the fit has it; by the label of each."""
     adjuster = problem.adjuster_of(fit)
     normal, (count, size) = adjuster.normal_equations(fit.adjusted), adjuster.free.poses.shape
     leverage: dict[int | str, float] = {}
     for places in known:
         image, derivative, precision = places.jacobians(adjuster, fit)
-        item, names = places.labels()
+        item, names = places.item, places.labels
         chosen = evenly_spaced(len(names), _MANY)
         gradients = np.zeros((count, size, len(chosen), 2))
         of_shared = np.zeros((len(normal.gradient_shared), len(chosen), 2))

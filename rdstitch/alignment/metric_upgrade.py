@@ -7,7 +7,6 @@ unknowns, so all of them are tried on a grid, from which the adjustment finds th
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,17 +25,10 @@ _AT_ONCE = 2**15
 _OUTLYING = 0.3  # error of the two conditions, relative, beyond which all errors count alike
 
 
-@dataclass(frozen=True, eq=False)
-class MetricPoses:
-    """Poses (N, 6) of one camera, as the planar models have them, the shared tilt (2,), radians, and log f."""
-
-    poses: FloatArray
-    tilt: FloatArray
-    log_focal: float
-
-
-def metric_upgrade(homographies: FloatArray, reference: int, log_focal: float, log_focal_std: float) -> MetricPoses:
-    """The poses of one camera that come nearest to plane-to-image homographies.
+def metric_upgrade(
+    homographies: FloatArray, reference: int, log_focal: float, log_focal_std: float
+) -> tuple[FloatArray, FloatArray]:
+    """The poses (N, 6) of one camera that come nearest to plane-to-image homographies; its tilt, radians, and log f.
 
     ``homographies`` (N, 3, 3): from any frame of the plane to undistorted coordinates of the images, half diagonals,
     with positive third coordinates in front of the camera; ``reference``: image that lies at the origin of the plane,
@@ -79,7 +71,7 @@ def _metric(relative: FloatArray, tilts: FloatArray, log_focal: float) -> FloatA
     return product
 
 
-def _decomposed(relative: FloatArray, tilt: FloatArray, log_focal: float) -> MetricPoses:
+def _decomposed(relative: FloatArray, tilt: FloatArray, log_focal: float) -> tuple[FloatArray, FloatArray]:
     """The nearest poses: ``[a b c] ~ R Rz(φ) [e1 e2 (-t, h)]``."""
     metric = _metric(relative, tilt[None], log_focal)[0]
     left, _, right = np.linalg.svd(metric[:, :, :2], full_matrices=False)
@@ -98,4 +90,4 @@ def _decomposed(relative: FloatArray, tilt: FloatArray, log_focal: float) -> Met
     poses[:, Y] = -(-s * flat[:, 0, 2] + c * flat[:, 1, 2]) * math.exp(log_focal)
     poses[:, LOG_HEIGHT] = np.log(np.clip(np.abs(flat[:, 2, 2]), 1e-3, 1e3))
     poses[:, [PSI, THETA]] = (tilts - shared) / math.exp(log_focal)
-    return MetricPoses(poses, shared, log_focal)
+    return poses, np.array([*shared, log_focal])

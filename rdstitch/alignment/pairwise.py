@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rdstitch.alignment.adjustment_problem import Problem
+from rdstitch.alignment.adjustment_problem import LinkProblem, Problem
 from rdstitch.alignment.least_squares.bundle_adjustment import (
     LOOSE_GAIN,
     BundleAdjuster,
@@ -15,9 +15,8 @@ from rdstitch.alignment.least_squares.bundle_adjustment import (
 )
 from rdstitch.alignment.least_squares.link_equations import split_lens
 from rdstitch.alignment.least_squares.observations import Observations
-from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.motion_models import HOMOGRAPHY, MotionModel
-from rdstitch.arrays import BoolArray, FloatArray, evenly_spaced
+from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.geometry.division_model import undistort
 from rdstitch.geometry.radial_homography import RadialHomography, transfer
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost, sigma_of
@@ -48,71 +47,54 @@ def relations_at(observations: Observations, relations: Sequence[RadialHomograph
     return result
 
 
-def independent_pairs(
-    model: MotionModel,
-    observations: Observations,
-    homographies: FloatArray,
-    shared: FloatArray,
-    lens: FloatArray,
-    free_lens: BoolArray,
-    known: CameraPriors,
-) -> tuple[BundleAdjuster, Parameters]:
+def independent_pairs(links: LinkProblem, model: MotionModel, shared: FloatArray) -> tuple[BundleAdjuster, Parameters]:
     """Return the adjustment of every link on its own, with the shared parameters in common, and where it starts.
 
-    Of the links' homographies (L, 3, 3) at this lens. Of what is known of the camera, attitudes are taken as exact, and
-    nothing of the poses besides.
+    Of what is known of the camera, attitudes are taken as exact, and nothing of the poses besides.
     """
-    count = 2 * len(observations)
-    start = Parameters(nearest_pairs(model, observations, homographies, shared, known.attitudes), shared, lens)
-    freedom = FreeParameters.fixing(model, count, list(range(0, count, 2)), free_lens)
-    first = 2 * np.arange(len(observations))
-    pairs, priors = replace(observations, image1=first, image2=first + 1), known.of_camera(model, count)
+    first = 2 * np.arange(len(links.observations))
+    start = Parameters(nearest_pairs(links, model, shared), shared, links.lens)
+    freedom = FreeParameters.fixing(model, 2 * len(first), first, links.free_lens)
+    pairs = replace(links.observations, image1=first, image2=first + 1)
+    priors = links.camera_priors.of_camera(model, 2 * len(first))
     return BundleAdjuster(model, pairs, freedom, priors, max_iterations=_MAX_ITERATIONS), start
 
 
-def nearest_pairs(
-    model: MotionModel, observations: Observations, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray
-) -> FloatArray:
-    """Poses of both images of every link, (2 L, ...), nearest to its homography (L, 3, 3); the first at the origin."""
-    tilts = attitudes[np.stack([observations.image1, observations.image2], axis=1)].reshape(-1, 2)
+def nearest_pairs(links: LinkProblem, model: MotionModel, shared: FloatArray) -> FloatArray:
+    """Poses of both images of every link, (2 L, ...), nearest to its homography; the first at the origin."""
+    images = np.stack([links.observations.image1, links.observations.image2], axis=1)
+    tilts = links.camera_priors.attitudes[images].reshape(-1, 2)
     matrices = model.nominal_homographies(shared, tilts)
-    matrices[1::2] = homographies @ matrices[0::2]
+    matrices[1::2] = links.homographies @ matrices[0::2]
     return model.nearest_poses(matrices, shared, tilts)
 
 
-def pairwise_homographies(
-    observations: Observations, homographies: FloatArray, lens: FloatArray, free_lens: BoolArray, known: CameraPriors
-) -> BundleAdjustmentResult:
+def pairwise_homographies(links: LinkProblem) -> BundleAdjustmentResult:
     """Every link on its own with a homography."""
-    adjuster, at = independent_pairs(HOMOGRAPHY, observations, homographies, np.empty(0), lens, free_lens, known)
-    return adjuster.run(at)
+    adjuster, start = independent_pairs(links, HOMOGRAPHY, np.empty(0))
+    return adjuster.run(start)
 
 
-def best_trial(problem: Problem, model: MotionModel) -> tuple[BundleAdjuster, Parameters]:
+def best_trial(links: LinkProblem, model: MotionModel) -> tuple[BundleAdjuster, Parameters]:
     """Of a few links on their own, from the shared parameters that come nearest to them without adjustment."""
-    known, links = problem.camera_priors, len(problem.observations)
-    few = evenly_spaced(links, _TRIAL_LINKS)
-    sample, homographies = problem.observations.subset(few).thinned(_TRIAL_MATCHES), problem.homographies[few]
-    trials = [
-        independent_pairs(model, sample, homographies, shared, problem.lens, problem.free_lens, known)
-        for shared in model.shared_starts(known.log_focal, known.tilt, tilt_known=known.tilt_known)
-    ]
+    known, few = links.camera_priors, evenly_spaced(len(links.observations), _TRIAL_LINKS)
+    sample = links.observations.subset(few).thinned(_TRIAL_MATCHES)
+    trial = LinkProblem(sample, links.homographies[few], links.lens, links.free_lens, known)
+    starts = model.shared_starts(known.log_focal, known.tilt, tilt_known=known.tilt_known)
+    trials = [independent_pairs(trial, model, shared) for shared in starts]
     squared = [adjuster.squared(start) for adjuster, start in trials]
     width = ALIGNMENT_WIDTH * min(float(np.median(sample.scale2)), *map(sigma_of, squared))
     adjuster, start = trials[int(np.argmin([robust_cost(each, width).sum() for each in squared]))]
     return replace(adjuster, min_gain=LOOSE_GAIN), start
 
 
-def fit_trial(problem: Problem, model: MotionModel) -> BundleAdjustmentResult:
+def fit_trial(links: LinkProblem, model: MotionModel) -> BundleAdjustmentResult:
     """A few links on their own under one camera."""
-    adjuster, start = best_trial(problem, model)
+    adjuster, start = best_trial(links, model)
     return adjuster.run(start)
 
 
 def fit_pairwise(problem: Problem, model: MotionModel, trial: BundleAdjustmentResult) -> BundleAdjustmentResult:
     """All links on their own under one camera, which starts as a trial has it."""
-    shared, known = trial.parameters.shared, problem.camera_priors
-    adjuster, start = independent_pairs(
-        model, problem.observations, problem.homographies, shared, problem.lens, problem.free_lens, known
-    )
+    adjuster, start = independent_pairs(problem, model, trial.parameters.shared)
     return replace(adjuster, min_gain=problem.min_gain).run(start)

@@ -6,10 +6,9 @@ from functools import cached_property
 
 import numpy as np
 
-from rdstitch.alignment.adjusted_images import AdjustedImages, GivenImages
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.alignment_options import AlignmentOptions
-from rdstitch.alignment.build_result import build_alignment
+from rdstitch.alignment.alignment_options import AlignmentOptions, GivenImages
+from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_strained
 from rdstitch.alignment.least_squares.bundle_adjustment import FEW_GAIN, MIN_GAIN
@@ -22,6 +21,7 @@ from rdstitch.alignment.noise import independent_errors
 from rdstitch.alignment.relief_weights import adjust_over_relief, choose_over_relief
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.select import ModelChoice, select_model
+from rdstitch.alignment.sentences import REFERENCE_LEFT_OUT
 from rdstitch.alignment.starts import fit_model
 from rdstitch.alignment.uncertainty import covariances, weigh_lens
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
@@ -45,22 +45,18 @@ _MATCHES_OF_ALL, _MATCHES_OF_A_LINK = 500_000, 40
 _MATCHES_FOR_SELECTION = 5_000  # correspondences of all links together that a model is chosen by
 _ROUNDS = 3  # rounds of rejecting wrong pairs and adjusting again
 
-_REFERENCE_LEFT_OUT = Message("the reference image that was named is not among those aligned; another one is taken")
-
 
 def align(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions | None = None) -> Alignment:
     """Align all images of one lens over one plane, or around one centre, by pairs that overlap, each once.
 
     :exc:`ArgumentError` where two links are between the same images; :exc:`RegistrationError` where no two are linked.
     """
-    return AlignmentTask(GivenImages(cameras, links, options or AlignmentOptions())).result
+    return AlignmentTask(cameras, links, options or AlignmentOptions()).result
 
 
 @dataclass(frozen=True, eq=False)
-class AlignmentTask:
+class AlignmentTask(GivenImages):
     """Alignment of some images: a draft, and the result, each computed when it is wanted."""
-
-    given: GivenImages
 
     @cached_property
     def draft(self) -> Alignment:
@@ -70,12 +66,12 @@ class AlignmentTask:
     @cached_property
     def result(self) -> Alignment:
         """Adjusted to all matches."""
-        return _with_checked_focal(_adjusted(self._selected), self.given.options)
+        return _with_checked_focal(_adjusted(self._selected), self.options)
 
     @cached_property
     def _selected(self) -> AdjustedImages:
-        _check(self.given)
-        return _lens_and_model(self.given)
+        _check(self)
+        return _lens_and_model(self)
 
 
 def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
@@ -112,7 +108,7 @@ def _lens_and_model(given: GivenImages) -> AdjustedImages:
     problem, _ = all_links.part(~wrong, images)
     choice = choose_over_relief(problem, choice, options.models, options.purpose)
     if options.reference is not None and options.reference not in images:
-        messages.append(_REFERENCE_LEFT_OUT)
+        messages.append(REFERENCE_LEFT_OUT)
     free = choice.fit.free_lens
     return AdjustedImages(
         replace(given, options=options),
@@ -130,10 +126,10 @@ def _problem_of_all_links(
     given: GivenImages, sample: Observations, lens: LensChoice, trust: FloatArray, known: CameraPriors, wrong: BoolArray
 ) -> Problem:
     """The problem of all images, with the reference that was asked for, or else a good one of those not ``wrong``."""
-    pairwise, reference = lens.pairwise, given.options.reference
-    count, start = len(given.cameras), pairwise.parameters.lens
+    homographies, start = lens.pairwise.homographies, lens.pairwise.parameters.lens
+    count, reference = len(given.cameras), given.options.reference
     all_links = Problem(
-        sample, pairwise.homographies, trust, count, reference, start, lens.free, known, min_gain=FEW_GAIN
+        sample, homographies, start, lens.free, known, trust=trust, count=count, fixed=reference, min_gain=FEW_GAIN
     )
     if reference is None:
         problem, images = all_links.part(~wrong)

@@ -17,7 +17,7 @@ from rdstitch.alignment.least_squares.link_equations import linearized_errors
 from rdstitch.alignment.lens.lens_selection import residual_coherence
 from rdstitch.alignment.motion_models import SIMILARITY, TILTING
 from rdstitch.alignment.noise import independent_errors, shows_relief
-from rdstitch.alignment.relief_field import Parallax
+from rdstitch.alignment.parallax import Parallax
 from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.alignment.starts import fit_model, start_from
 from rdstitch.arrays import FloatArray

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 from typing import Self
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.alignment.motion_models import MODELS
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, Rows
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rigid_in_plane
 from rdstitch.geometry.radial_homography import from_plane, to_plane
@@ -45,7 +45,7 @@ class LinkFit:
 
 
 @dataclass(frozen=True, eq=False)
-class PlanarPoses:
+class PlanarPoses(Rows):
     """Where the camera was for each image, in a metric plane."""
 
     yaw: FloatArray  # (N,): φ, radians
@@ -170,17 +170,13 @@ class Alignment:
         placed = {copy: first for copy, first in copies.items() if self.used[first]}
         origin = np.arange(len(self.used))
         origin[list(placed)] = list(placed.values())
-        poses = self.poses
-        if poses is not None:
-            given = {each.name: getattr(poses, each.name) for each in fields(poses)}
-            poses = replace(poses, **{name: part[origin] for name, part in given.items() if part is not None})
         fits = [replace(fit, image1=i, image2=j) for fit, (i, j) in zip(self.links, pairs, strict=True)]
         groups = (tuple(k for k in group if k not in copies) for group in self.components)
         return replace(
             self,
             homographies=self.homographies[origin],
             used=self.used[origin],
-            poses=poses,
+            poses=None if self.poses is None else self.poses.take(origin),
             links=tuple(fits),
             components=tuple(
                 tuple(sorted({*group, *(copy for copy, first in copies.items() if first in group)}))

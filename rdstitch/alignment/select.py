@@ -16,8 +16,8 @@ from typing import Self
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.frames.reference_frame import MAX_STRETCH
-from rdstitch.alignment.least_squares.link_equations import split_lens, whitened_errors
+from rdstitch.alignment.frames.reference_frame import MAX_STRETCH, stretch
+from rdstitch.alignment.least_squares.link_equations import whitened_errors
 from rdstitch.alignment.lens.lens_selection import NO_COHERENCE, residual_coherence
 from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.alignment.noise import evidence_of
@@ -25,46 +25,12 @@ from rdstitch.alignment.pairwise import fit_pairwise, fit_trial
 from rdstitch.alignment.starts import fit_model
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.choices import Purpose
-from rdstitch.geometry.division_model import undistort
-from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.posterior import TWENTY_TO_ONE, Evidence
 
-_GRID = np.stack(np.meshgrid([-0.8, 0.0, 0.8], [-0.6, 0.0, 0.6]), axis=-1).reshape(-1, 2)
-"""Half diagonals: points of an image of usual proportions, out to the corners."""
-
-_FRAMES = 12  # images that are tried as the frame of a plane without a metric
-
-
-def stretch(fit: Fit) -> float:
-    """Return the ratio of the areas that a pixel gets, 98 % over 2 % of all images; inf where they are folded.
-
-    On a sphere every direction has the same room. A plane that has no metric is seen as the image shows it that does so
-    best.
-    """
-    if fit.model.on_sphere:
-        return 1.0
-    distortion, higher, center = split_lens(fit.adjusted.parameters.lens)
-    undistorted = undistort(_GRID - center, distortion, higher)
-    rays = np.column_stack([undistorted, np.ones(len(_GRID))])
-    matrices = fit.adjusted.matrices.matrices
-    to_plane = inverses(matrices)
-    if fit.model.one_camera:
-        return _ratio(rays, to_plane)
-    return min(_ratio(rays, frame @ to_plane) for frame in matrices[:: -(-len(matrices) // _FRAMES)])
-
-
-def _ratio(rays: FloatArray, to_plane: FloatArray) -> float:
-    """Ratio of the areas around rays (P, 3) of all images, whose homographies are (N, 3, 3)."""
-    depth = rays @ to_plane[:, 2].T
-    with np.errstate(all="ignore"):
-        areas = np.abs(np.linalg.det(to_plane)) / depth**3
-    low, high = np.quantile(np.where(areas > 0.0, areas, np.inf), [0.02, 0.98], method="nearest")
-    return float(high / low) if np.isfinite(low) else np.inf
-
-
 _MIN_RATIO = 3.0
-"""Times by which the errors of one camera must exceed those of free homographies, one an image: these fit relief better
-than any camera does, by up to 2.2 times over strips of rendered relief, and their chains drift projectively."""
+"""Times by which the errors of one camera must exceed those of free homographies, one an image, where numbers are
+wanted: these fit relief better than any camera does, by up to 2.2 times over strips of rendered relief, and their
+chains drift projectively. In pictures seams say what errors matter."""
 
 _TYPICAL_TILT_SPREAD = math.radians(3.0)
 """Spread of tilts from which on a wider one costs: Occam's factor of the hierarchical prior on the tilts."""
@@ -125,6 +91,11 @@ class Posterior:
     def least_field(self) -> float:
         """Pixels: what neighbours share of the errors of links on their own, which no model undercuts by much."""
         return float(self.evidence.cost(self.link_errors).field[0])
+
+    @cached_property
+    def tolerable(self) -> float:
+        """Shared errors, pixels of a coordinate, that local alignment and seams can hide."""
+        return math.hypot(_TOLERABLE * float(self.evidence.farthest[0]), float(self.evidence.noise[0]))
 
     def scored(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
@@ -239,18 +210,19 @@ def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
     """The one with the best score; free homographies only of what one camera does not explain.
 
     Where a plane that nobody would lay out explains the images, so do free homographies: a turn whose errors seams can
-    hide is taken instead.
+    hide is taken instead; so it is of a picture where homographies are hardly more probable.
     """
     cameras = [one for one in tried if one.fit.model.one_camera] or tried
-    best, evidence = min(cameras, key=_score), posterior.evidence
-    if best.implausible:
-        tolerable = math.hypot(_TOLERABLE * float(evidence.farthest[0]), float(evidence.noise[0]))
-        kept = [one for one in tried if one.field < tolerable and not one.implausible]
-        kept = [one for one in kept if one.fit.model.on_sphere] or (kept if math.isinf(best.stretch) else [])
-        if kept:
-            return min(kept, key=_score)
+    best = min(cameras, key=_score)
     free = [one for one in tried if not one.fit.model.one_camera]
-    return min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_score)
+    chosen = min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_score)
+    hidden = [one for one in tried if one.field < posterior.tolerable and not one.implausible]
+    turns, kept = [one for one in hidden if one.fit.model.on_sphere], list[Hypothesis]()
+    if best.implausible:
+        kept = turns or (hidden if math.isinf(best.stretch) else [])
+    elif posterior.purpose.picture and not chosen.fit.model.one_camera:
+        kept = [one for one in turns if one.score < chosen.score + TWENTY_TO_ONE]
+    return min(kept, key=_score, default=chosen)
 
 
 def _score(one: Hypothesis) -> float:
@@ -259,7 +231,8 @@ def _score(one: Hypothesis) -> float:
 
 def _is_beyond_one_camera(posterior: Posterior, best: Hypothesis, free: float) -> bool:
     """Whether free homographies with such a field compete; two images need no more than one."""
-    return posterior.problem.count == 2 or best.implausible or best.field > _MIN_RATIO * free
+    largest = posterior.tolerable if posterior.purpose.picture else _MIN_RATIO * free
+    return posterior.problem.count == 2 or best.implausible or best.field > largest
 
 
 def parameter_count(problem: Problem, model: MotionModel, free_lens: BoolArray) -> int:

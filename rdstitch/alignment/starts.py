@@ -63,9 +63,8 @@ def _upgraded(problem: Problem, model: MotionModel) -> Parameters:
     """Chained homographies with the metric of the plane that makes them images of one camera."""
     prior, tree = problem.camera_priors, _tree(problem)
     chained = tree.chained(problem.homographies, problem.observations.image1, np.eye(3))
-    upgraded = metric_upgrade(chained, tree.root, prior.log_focal, prior.log_focal_std)
-    shared = model.shared_from_physical(np.array([*upgraded.tilt, upgraded.log_focal]))
-    return Parameters(upgraded.poses, shared, problem.lens)
+    poses, physical = metric_upgrade(chained, tree.root, prior.log_focal, prior.log_focal_std)
+    return Parameters(poses, model.shared_from_physical(physical), problem.lens)
 
 
 def _one_camera_links(
@@ -81,8 +80,7 @@ def _one_camera_links(
     elif shared is None:
         adjuster, at = best_trial(problem, model)
         shared = (at if len(problem.observations) == 1 else adjuster.run(at).parameters).shared
-    poses = nearest_pairs(model, problem.observations, problem.homographies, shared, problem.camera_priors.attitudes)
-    matrices = model.matrices(poses, shared).matrices
+    matrices = model.matrices(nearest_pairs(problem, model, shared), shared).matrices
     return shared, matrices[1::2] @ inverses(matrices[0::2])
 
 

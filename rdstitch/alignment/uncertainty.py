@@ -218,10 +218,10 @@ def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:
 
 
 def lever_std(problem: Problem, fit: Fit) -> float:
-    """How far relief moves the ground in the middle of an image against the camera's foot, by a planar fit.
+    """How far relief moves the ground in the middle of an image against the nadir below the camera, by a planar fit.
 
     Standard deviation of a coordinate, in heights of the reference image: tilts that grow along a flight over hills put
-    all feet right, and make the ground larger or smaller.
+    all nadirs right, and make the ground larger or smaller.
     """
     adjuster, parameters, model = problem.adjuster_of(fit), fit.adjusted.parameters, fit.model
     steps_of_poses, steps_of_shared = _relief(adjuster, fit.adjusted).steps()

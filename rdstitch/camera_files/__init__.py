@@ -3,14 +3,25 @@
 What is read is known by its content, what is written by its name or by ``camera_format``: see docs/formats.md.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from rdstitch.camera_files import formats
 from rdstitch.camera_files.lens_models import CameraFile, LensFit
+from rdstitch.camera_files.opencv import ImageSize, camera_info_yaml, is_opencv, opencv_text, read_opencv
+from rdstitch.camera_files.own_record import OWN, OWN_COMMENT
+from rdstitch.camera_files.photogrammetry import (
+    camera_chain_yaml,
+    colmap_cameras,
+    colmap_text,
+    opendronemap_json,
+    read_colmap,
+    read_kalibr,
+    read_opendronemap,
+)
 from rdstitch.camera_files.polynomials import hugin_project, is_hugin, lensfun_xml, read_hugin, read_lensfun
 from rdstitch.choices import CameraFormat
 from rdstitch.errors import ArgumentError, InputError, OutputError
@@ -58,50 +69,53 @@ def load_camera(path: str | Path, image_size: tuple[int, int] | None = None) -> 
     return read_camera_file(path, None if image_size is None else lambda: image_size).camera
 
 
-def read_camera_file(path: str | Path, image_size: formats.ImageSize | None = None) -> CameraFile:
+def read_camera_file(path: str | Path, image_size: ImageSize | None = None) -> CameraFile:
     """Read a camera file of any known format.
 
     A file that rdstitch wrote gives back λ exactly; to the lens model of any other, λ is fitted.
     """
     text, file = read_text(path), str(path)
-    try:
+    with _naming(file):
         if text.lstrip().startswith("{"):
             return _of_content(parse_json(text, file), file, image_size)
-        own_record = next((line for line in text.splitlines() if line.startswith(formats.OWN_COMMENT)), None)
-        if own_record is not None:
-            return _own(parse_json(own_record.removeprefix(formats.OWN_COMMENT), file), file)
+        own = next((line for line in text.splitlines() if line.startswith(OWN_COMMENT)), None)
+        if own is not None:
+            return _own(parse_json(own.removeprefix(OWN_COMMENT), file), file)
         if text.lstrip().startswith("<"):
             return read_lensfun(text, file, image_size)
         if is_hugin(text):
             return read_hugin(text, file)
-        if cameras := formats.colmap_cameras(text):
-            return formats.read_colmap(_only(cameras), file)
+        if cameras := colmap_cameras(text):
+            return read_colmap(_only(cameras), file)
         return _of_content(parse_yaml(text, file), file, image_size)
-    except ArgumentError as error:
-        raise InputError(f"{file}: {error}") from error
 
 
 def camera_of_content(content: dict[str, Any], file: str) -> CameraFile:
     """The camera of a message of ROS, as plain values, to which λ is fitted."""
-    try:
+    with _naming(file):
         return _of_content(content, file, None)
+
+
+@contextmanager
+def _naming(file: str) -> Iterator[None]:
+    """What is wrong with the content is an error that names the file."""
+    try:
+        yield
     except ArgumentError as error:
         raise InputError(f"{file}: {error}") from error
 
 
-def _of_content(content: Any, file: str, image_size: formats.ImageSize | None) -> CameraFile:
+def _of_content(content: Any, file: str, image_size: ImageSize | None) -> CameraFile:
     """The camera of plain values, whosever they are."""
-    if formats.is_opencv(content):
-        if (own_record := content.get(formats.OWN)) is not None:
-            return _own(own_record, file, formats.OWN)
-        return formats.read_opencv(content, file, image_size)
+    if is_opencv(content):
+        own = content.get(OWN)
+        return read_opencv(content, file, image_size) if own is None else _own(own, file, OWN)
     entries = content.items() if isinstance(content, dict) else ()
-    for key, read in (("projection_type", formats.read_opendronemap), ("camera_model", formats.read_kalibr)):
+    for key, read in (("projection_type", read_opendronemap), ("camera_model", read_kalibr)):
         if matching := [(name, entry) for name, entry in entries if isinstance(entry, dict) and key in entry]:
             name, entry = _only(matching)
-            if (own_record := entry.get(formats.OWN)) is not None:
-                return _own(own_record, file, f"{name}.{formats.OWN}")
-            return read(entry, file, str(name))
+            own = entry.get(OWN)
+            return read(entry, file, str(name)) if own is None else _own(own, file, f"{name}.{OWN}")
     return _own(content, file)
 
 
@@ -179,14 +193,14 @@ class _Format(NamedTuple):
 
 # The first whose pattern fits is what a name says.
 _FORMATS = (
-    _Format("opendronemap", ("cameras.json",), formats.opendronemap_json),
-    _Format("opencv-json", ("opencv.json", "*.opencv.json"), partial(formats.opencv_text, yaml=False)),
+    _Format("opendronemap", ("cameras.json",), opendronemap_json),
+    _Format("opencv-json", ("opencv.json", "*.opencv.json"), partial(opencv_text, yaml=False)),
     _Format("rdstitch", ("?*.json",), lambda camera: (json_bytes(camera_json(camera)).decode(), None)),
-    _Format("ros", ("camera_info.yaml",), formats.camera_info_yaml),
-    _Format("kalibr", ("camchain.yaml",), formats.camera_chain_yaml),
-    _Format("fisheye", ("fisheye.yaml", "*.fisheye.yaml"), partial(formats.opencv_text, fisheye=True)),
-    _Format("opencv", ("?*.yaml",), formats.opencv_text),
-    _Format("colmap", ("cameras.txt",), formats.colmap_text),
+    _Format("ros", ("camera_info.yaml",), camera_info_yaml),
+    _Format("kalibr", ("camchain.yaml",), camera_chain_yaml),
+    _Format("fisheye", ("fisheye.yaml", "*.fisheye.yaml"), partial(opencv_text, fisheye=True)),
+    _Format("opencv", ("?*.yaml",), opencv_text),
+    _Format("colmap", ("cameras.txt",), colmap_text),
     _Format("hugin", ("?*.pto",), hugin_project),
     _Format("lensfun", ("?*.xml",), lensfun_xml),
 )

@@ -6,7 +6,7 @@ the camera, whose images are resampled by it.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -36,10 +36,6 @@ class LensFit:
 
     rms: float  # rms, largest: of the distances between the pixels that both models give, over the whole image, pixels
     largest: float
-
-
-Written = tuple[str, LensFit]
-"""A camera file, and how far its model is from the lens."""
 
 
 def _least_squares(terms: FloatArray, values: FloatArray) -> FloatArray:
@@ -112,27 +108,28 @@ _MODELS: dict[str, tuple[tuple[int, ...], tuple[int | None, ...]]] = {
 OpenCV's is, None for the tangential ones."""
 
 
-def nearest_model(camera: Camera, *models: str, close: float = CLOSE) -> tuple[LensModel, LensFit]:
-    """The lens as one of :data:`_MODELS`: the first that is so close, pixels, or else the nearest.
+def nearest_model(camera: Camera, names: Mapping[str, str], close: float = CLOSE) -> tuple[LensModel, LensFit, str]:
+    """The lens as one of :data:`_MODELS`, and its name: the first that is so close, pixels, or else the nearest.
 
-    A lens of another program's calibration is given as it is where a model has all its terms; else the radial terms are
-    fitted, and its two focal lengths and its tangential terms kept.
+    ``names`` are those that a format has for the models that it knows. A lens of another program's calibration is given
+    as it is where a model has all its terms; else the radial terms are fitted, and its two focal lengths and its
+    tangential terms kept.
     """
     lens, fits = camera.lens_model, []
-    kinds: dict[str, LensKind] = {model: "fisheye" if model == "fisheye" else "brown" for model in models}
+    kinds: dict[str, LensKind] = {model: "fisheye" if model == "fisheye" else "brown" for model in names}
     if lens is not None and math.isclose(lens.mean_focal, camera.focal or 0.0):
         for model, kind in kinds.items():
             count = len(_MODELS[model][1])
             if kind == lens.kind and not any(lens.coefficients[count:]):
                 padded = (*lens.coefficients, *[0.0] * count)[:count]
-                return replace(lens, coefficients=padded), LensFit(0.0, 0.0)
+                return replace(lens, coefficients=padded), LensFit(0.0, 0.0), names[model]
     for model, kind in kinds.items():
         (powers, places), base = _MODELS[model], _without_radial_terms(camera, kind)
         samples = LensSamples.of(camera, base)
         start = np.arctan(samples.undistorted) if kind == "fisheye" else samples.undistorted
         numbers = samples.fit(start, powers) if powers else samples.fit_rational()
         k = tuple(base.coefficients[i] if at is None else float(numbers[at]) for i, at in enumerate(places))
-        fits.append((fitted := replace(base, coefficients=k, kind=kind), samples.compare(fitted)))
+        fits.append((fitted := replace(base, coefficients=k, kind=kind), samples.compare(fitted), names[model]))
         if fits[-1][1].largest <= close:
             break
     return min(fits, key=lambda one: one[1].largest)

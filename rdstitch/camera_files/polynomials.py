@@ -18,8 +18,8 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Struct
 
-from rdstitch.camera_files.formats import comments
-from rdstitch.camera_files.lens_models import CLOSE, CameraFile, LensFit, LensSamples, Written, fitted_camera
+from rdstitch.camera_files.lens_models import CLOSE, CameraFile, LensFit, LensSamples, fitted_camera
+from rdstitch.camera_files.own_record import Written, comments
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel

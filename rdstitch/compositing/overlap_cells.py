@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import reduce
 from typing import Any, NamedTuple, Self
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -129,11 +128,13 @@ def _cells_of_overlap(a: _Shown, b: _Shown, box: Box) -> Iterator[tuple[FloatArr
         [cut(values, image.tile.box, box)[::step, ::step] for values, image in zip(both, (a, b), strict=True)]
         for both in compared
     )
-    clipped = np.stack([each > 1 for each in lit] + [each > 2 for each in lit], axis=-1)
-    layers = _Layers(np.concatenate(samples, axis=-1), clipped, np.stack([p, q, p * p, q * q, p * q], axis=-1))
-    stacked = np.concatenate(layers, axis=-1, dtype=np.float32)
-    for which in filter(np.any, (lit[0] * lit[1] == 1, lit[0] * lit[1] > 1)):
-        middles, means = _cell_means(which, stacked, side // step)
+    used = [which for which in (lit[0] * lit[1] == 1, lit[0] * lit[1] > 1) if which.any()]
+    if used:
+        clipped = [each > least for least in (1, 2) for each in lit]
+        channels = [np.moveaxis(each, -1, 0) for each in samples]
+        layers = np.concatenate([*channels, np.stack([*clipped, p, q, p * p, q * q, p * q])], dtype=np.float32)
+    for which in used:
+        middles, means = _cell_means(which, layers, side // step)
         yield step * middles + box[:2], means
 
 
@@ -168,8 +169,8 @@ def _light(tile: SurveyTile) -> NDArray[np.uint8]:
     return np.asarray((tile.inside & (low > darkest)).astype(np.uint8) << clipped)
 
 
-def _cell_means(which: BoolArray, values: Float32Array, side: int) -> tuple[FloatArray, FloatArray]:
-    """Mean x, y (M, 2), pixels of the box, and values (h, w, K) of every cell of which more than half counts, (M, K).
+def _cell_means(which: BoolArray, layers: Float32Array, side: int) -> tuple[FloatArray, FloatArray]:
+    """Mean x, y (M, 2), pixels of the box, and layers (K, h, w) of every cell of which more than half counts, (M, K).
 
     As products with matrices of ones and zeros, which are many times faster than sums along short axes.
     """
@@ -180,8 +181,7 @@ def _cell_means(which: BoolArray, values: Float32Array, side: int) -> tuple[Floa
     weight = which.astype(np.float32)
     count, x, y = (a @ weight @ b.T for a, b in ((rows, columns), (rows, across), (down, columns)))
     used = count > side**2 / 2
-    # OpenCV masks, and NumPy's product sums, all channels at once.
-    chosen = cv2.copyTo(values, which.view(np.uint8))
-    along = (rows @ chosen.reshape(len(chosen), -1)).reshape(len(rows), which.shape[1], -1)
+    chosen = np.where(which, layers, np.float32(0.0)).reshape(-1, which.shape[1])
+    sums = rows @ (chosen @ columns.T).reshape(len(layers), len(which), -1)
     divisor = count[used][:, None].astype(np.float64)
-    return np.column_stack([x[used], y[used]]) / divisor, (columns @ along)[used] / divisor
+    return np.column_stack([x[used], y[used]]) / divisor, sums[:, used].T / divisor

@@ -203,8 +203,9 @@ def _verdicts(
     if not len(at):
         return
     windows1, windows2, near = _windows(first, at), _windows(second, at), near_border(at)
-    spread = np.stack([windows1.std(axis=(1, 2)), windows2.std(axis=(1, 2))])
-    differ, alike = _difference(windows1, windows2, near), correlation(windows1, windows2)
+    flat1, flat2 = (windows.reshape(len(at), -1) for windows in (windows1, windows2))
+    spread = np.stack([flat1.std(axis=1), flat2.std(axis=1)])
+    differ, alike = _difference(windows1, windows2, near), correlation(flat1, flat2)
     for k, (place, reach) in enumerate(zip(at, reaches.tolist(), strict=True)):
         if spread[:, k].max() < contrast:
             yield None
@@ -258,16 +259,13 @@ def _on_border(labels: NDArray[np.int32], label_size: float, pair: IntArray) -> 
 
 def _difference(windows1: Float32Array, windows2: Float32Array, mask: BoolArray) -> FloatArray:
     """Standard deviation of what two windows differ by where the mask is, but for brightness and some contrast."""
-    count = np.maximum(mask.sum(axis=(1, 2)), 1)
-
-    def mean(values: Any) -> FloatArray:
-        return np.asarray((values * mask).sum(axis=(1, 2)) / count, dtype=np.float64)
-
-    u, v = (w - mean(w)[:, None, None] for w in (windows1, windows2))
-    uu, vv, uv = mean(u * u), mean(v * v), mean(u * v)
+    u, v, counted = (each.reshape(len(mask), -1) for each in (windows1, windows2, mask.astype(np.float32)))
+    count = np.maximum(counted.sum(axis=1), 1)
+    u, v = ((w - np.einsum("ij,ij->i", w, counted)[:, None] / count[:, None]) * counted for w in (u, v))
+    uu, vv, uv = (np.einsum("ij,ij->i", a, b) / count for a, b in ((u, u), (v, v), (u, v)))
     larger, smaller = np.maximum(uu, vv), np.minimum(uu, vv)
     gain = np.clip(uv / np.maximum(larger, 1e-9), 0.5, 1.0)
-    return np.sqrt(np.maximum(smaller - 2.0 * gain * uv + gain**2 * larger, 0.0))
+    return np.asarray(np.sqrt(np.maximum(smaller - 2.0 * gain * uv + gain**2 * larger, 0.0)), dtype=np.float64)
 
 
 def _differ_coarsely(window1: Float32Array, window2: Float32Array, mask: BoolArray, contrast: float) -> bool:
@@ -278,11 +276,11 @@ def _differ_coarsely(window1: Float32Array, window2: Float32Array, mask: BoolArr
     return bool(_difference(first, second, mask[None])[0] > contrast)
 
 
-def correlation(windows1: Float32Array, windows2: Float32Array) -> FloatArray:
-    """Normalized correlation of windows (N, h, w)."""
-    u, v = (w - w.mean(axis=(1, 2), keepdims=True) for w in (windows1, windows2))
-    norms = np.sqrt((u * u).sum(axis=(1, 2)) * (v * v).sum(axis=(1, 2)))
-    return np.asarray((u * v).sum(axis=(1, 2)) / np.maximum(norms, 1e-9), dtype=np.float64)
+def correlation(windows1: FloatArray | Float32Array, windows2: FloatArray | Float32Array) -> FloatArray:
+    """Normalized correlation of windows (N, pixels)."""
+    u, v = (w - w.mean(axis=1, keepdims=True) for w in (windows1, windows2))
+    uu, vv, uv = (np.einsum("ij,ij->i", a, b) for a, b in ((u, u), (v, v), (u, v)))
+    return np.asarray(uv / np.maximum(np.sqrt(uu * vv), 1e-9), dtype=np.float64)
 
 
 def _best_shift(first: SeamTile, second: SeamTile, at: IntArray, reach: int) -> tuple[float, float]:

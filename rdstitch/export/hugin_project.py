@@ -31,14 +31,13 @@ def project_of_hugin(registration: Registration, canvas: Canvas) -> str:
     if any(source.frame is not None and source.frame.number is not None for source in sources):
         raise ArgumentError("Hugin opens image files, not frames of videos; write them as files first")
     quarters = QuarterTurns.of(sources)
-    alignment = quarters.stored_alignment(registration.alignment)
+    alignment = quarters.back.alignment(registration.alignment)
     if alignment.poses is None and not alignment.on_sphere:
         raise ArgumentError("Hugin knows no images with a homography of their own; --model pose gives poses")
     # The axes of the output are those of the upright reference image.
     k = alignment.reference
-    matrix = (
-        alignment.homographies[k] @ quarters.matrices_back[k] @ np.linalg.inv(registration.alignment.homographies[k])
-    )
+    upright = np.linalg.inv(registration.alignment.homographies[k])
+    matrix = alignment.homographies[k] @ quarters.back.matrices[k] @ upright
     if alignment.poses is not None and canvas.orientation is not None:
         matrix = matrix @ np.linalg.inv(canvas.orientation)
     seen = np.tensordot(matrix * np.sign(np.linalg.det(matrix)), _seen_on(canvas), axes=1)
@@ -80,7 +79,7 @@ def _control_lines(
             continue
         (i, j), link = pair.images, pair.link().thinned(_CONTROL_POINTS)
         first, second = (
-            _in_file(points, registration.alignment.cameras[k], alignment.cameras[k], quarters.upright[k]).tolist()
+            _in_file(points, registration.alignment.cameras[k], alignment.cameras[k], quarters.orientations[k]).tolist()
             for k, points in ((i, link.points1), (j, link.points2))
         )
         lines += [

@@ -68,7 +68,7 @@ def write_layers(
 
 def stage_layers(result: OutputImage, files: Mapping[str, tuple[Path, Path]], outputs: Outputs, *, whole: bool) -> None:
     """Stage the layer and the mask of each image of a result, whose names say the files."""
-    images = result.placed.images(result.canvas.near)
+    images = result.placed.images(result.canvas)
     task = decide(images, result.canvas, replace(result.options.composite, crop="none"))
     with prepare_composite(task) as prepared:
         canvas = prepared.tiles.box

@@ -14,6 +14,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import WGS84, Crs, middle
 from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import to_plane
+from rdstitch.inputs.source import Source
 
 MIN_POSITIONS = 3
 
@@ -22,10 +23,11 @@ MIN_POSITIONS = 3
 _MAX_ERROR = 0.25
 
 
-def has_place(positions: Sequence[GpsPosition | None]) -> bool:
-    """Check whether enough places are known; phones give several images the one that they found last."""
-    known = {(position.latitude, position.longitude) for position in positions if position is not None}
-    return len(known) >= MIN_POSITIONS
+def has_place(sources: Sequence[Source]) -> bool:
+    """Whether control points or enough places are known; phones give several images the one that they found last."""
+    places = [source.metadata.gps for source in sources]
+    known = {(place.latitude, place.longitude) for place in places if place is not None}
+    return len(known) >= MIN_POSITIONS or any(source.control for source in sources)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
 
 import cv2
 import numpy as np
@@ -113,22 +112,6 @@ def matched_corners(
     warped = cv2.remap(other.grey, places, None, cv2.INTER_CUBIC)  # type: ignore[call-overload]
     at, kept = _moved(warped, frame, corners[seen], _EXPECTED_LEVELS)
     return before[seen][kept], at[kept]
-
-
-def fitted_affine(target: FloatArray, source: FloatArray, threshold: float) -> tuple[FloatArray | None, BoolArray]:
-    """Fit the affine motion (2, 3) that brings most points (N, 2) to others, and mark those (N,)."""
-    known = np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1)
-    inliers = np.zeros(len(source), dtype=np.bool_)
-    if known.sum() < 3:
-        return None, inliers
-    estimate: Any = cv2.estimateAffine2D(
-        source[known], target[known], method=cv2.RANSAC, ransacReprojThreshold=threshold
-    )
-    motion, agree = estimate
-    if motion is None:
-        return None, inliers
-    inliers[known] = agree[:, 0] > 0
-    return np.asarray(motion, dtype=np.float64), inliers
 
 
 def _moved(

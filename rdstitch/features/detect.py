@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.features.keypoints import Features
-from rdstitch.features.learned import AlikedDetection
-from rdstitch.features.opencv import OpenCVDetection
+from rdstitch.features.keypoints import Detection, Features
+from rdstitch.features.learned import detect_aliked
+from rdstitch.features.opencv import detect_opencv
 from rdstitch.features.prepared_image import CLIP_LIMIT, Mask, PixelArray, PreparedImage, View, prepare
-from rdstitch.features.sift_tiles import LARGE, SiftTilesDetection
-from rdstitch.features.surf.descriptor import SurfDetection
+from rdstitch.features.sift_tiles import LARGE, detect_sift_in_tiles
+from rdstitch.features.surf.descriptor import detect_surf
 from rdstitch.options.feature_options import CLOSER, FeatureOptions
 
 _MIN_KEYPOINT_FRACTION = 0.5  # of the keypoints wanted: where a reduced image shows fewer, a larger one is used
@@ -20,19 +20,16 @@ _SPREAD_CELL = 0.05  # side of a cell over which keypoints are spread, diagonals
 # Fraction of the keypoints that must be seen at less contrast, too; of fewer, contrast is what is missing.
 _LASTING = 0.5
 
-Detection = SurfDetection | AlikedDetection | SiftTilesDetection | OpenCVDetection
-"""Keypoints of one image, not yet described; always in the same order for the same image."""
-
 
 def find(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection:
     """Find the keypoints of an image by the detector that the options name."""
     if options.kind == "surf":
-        return SurfDetection.find(grey)
+        return detect_surf(grey)
     if options.kind == "aliked":
-        return AlikedDetection.find(grey, options)
+        return detect_aliked(grey, options)
     if options.kind in ("sift", "rootsift") and grey.size > LARGE:
-        return SiftTilesDetection.find(grey, options)
-    return OpenCVDetection.find(grey, options)
+        return detect_sift_in_tiles(grey, options)
+    return detect_opencv(grey, options)
 
 
 def strongest(response: FloatArray, count: int) -> NDArray[np.intp]:
@@ -43,9 +40,8 @@ def strongest(response: FloatArray, count: int) -> NDArray[np.intp]:
 def spread(points: FloatArray, response: FloatArray, count: int, cell: float) -> NDArray[np.intp]:
     """Indices of ``count`` keypoints at most (N, 2) that are spread over the image, strongest first.
 
-    The cells of a grid, ``cell`` pixels a side, take turns, each giving its strongest keypoint that is left: no cell
-    gets more than another that still has some. The corners, where the distortion is seen, thus keep what they have
-    however strong the middle of the image is.
+    The cells of a grid, ``cell`` pixels a side, take turns, each giving its strongest keypoint that is left: the
+    corners, where the distortion is seen, keep what they have however strong the middle of the image is.
     """
     if len(points) <= count:
         return strongest(response, count)
@@ -66,9 +62,8 @@ ViewLoader = Callable[[float | None], View]
 def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask | None = None) -> Features:
     """Detect and describe the features of one image: the same whatever the number of threads, strongest first.
 
-    The image is grey, grey with alpha, RGB or RGB with alpha; uint8, or uint16 or float, which are stretched to 8 bits.
-    Nothing is detected where alpha is zero, a float is not finite, or the mask is False or zero; a keypoint whose
-    extent reaches into such a place is dropped.
+    The image is grey or RGB, with alpha or without; uint16 and float are stretched to 8 bits. No keypoint reaches into
+    places where alpha is zero, a float is not finite, or the mask is False or zero.
     """
     return detect_view(lambda _: View(image, mask), options or FeatureOptions())
 

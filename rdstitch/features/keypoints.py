@@ -1,6 +1,6 @@
 """Results of detection and matching: keypoints and descriptors of an image, and corresponding points of two."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
@@ -73,6 +73,21 @@ class Features:
     def binary(self) -> bool:
         """True for descriptors of bits, compared by the Hamming distance."""
         return self.descriptors.dtype == np.uint8
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """Keypoints of one image, not yet described; always in the same order for the same image."""
+
+    points: FloatArray  # (N, 2): places, pixels of the image
+    scale: FloatArray  # (N,): diameters, pixels
+    response: FloatArray  # (N,): strengths, in units of the detector
+    describe: Callable[[NDArray[np.intp]], Features]  # features of the keypoints of some indices
+
+    def take(self, index: NDArray[np.intp]) -> "Detection":
+        """The keypoints of the given indices, in their order."""
+        points, scale, response = self.points[index], self.scale[index], self.response[index]
+        return Detection(points, scale, response, lambda chosen: self.describe(index[chosen]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,60 +7,36 @@ OpenCV's own tests use: ALIKED takes ``image`` and gives ``keypoints``, ``descri
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.features.keypoints import Correspondences, Features
+from rdstitch.features.keypoints import Correspondences, Detection, Features
 from rdstitch.options.feature_options import FeatureOptions
 from rdstitch.system.opencv_state import silent_opencv
 
 
-@dataclass(frozen=True, eq=False)
-class AlikedDetection:
-    """Keypoints of an image by ALIKED, which describes all of them at once."""
-
-    points: FloatArray
-    response: FloatArray
-    descriptors: NDArray[np.float32]
-
-    @classmethod
-    def find(cls, grey: NDArray[np.uint8], options: FeatureOptions) -> Self:
-        """Run the network on an image."""
-        assert options.aliked_model is not None
-        network = _load("ALIKED", options.aliked_model, _aliked_parameters(options.aliked_size))
-        try:
-            keypoints, descriptors = network.detectAndCompute(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), None)
-        except cv2.error as error:
-            raise InputError(f"{options.aliked_model}: not an ALIKED network that OpenCV can run") from error
-        rows = np.array([(*k.pt, k.response) for k in keypoints], dtype=np.float64).reshape(-1, 3)
-        if descriptors is None:
-            descriptors = np.zeros((0, network.descriptorSize()))
-        return cls(rows[:, :2], rows[:, 2], np.asarray(descriptors, np.float32))
-
-    @property
-    def scale(self) -> FloatArray:
-        """Diameters, pixels: the network has but one scale."""
-        return np.ones(len(self.points))
-
-    def describe(self, chosen: NDArray[np.intp]) -> Features:
-        """Features of the chosen keypoints."""
-        return Features(
-            points=self.points[chosen],
-            descriptors=self.descriptors[chosen],
-            scale=self.scale[chosen],
-            angle=np.zeros(len(chosen)),
-            response=self.response[chosen],
-            laplacian_sign=None,
-            kind="aliked",
-        )
+def detect_aliked(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection:
+    """Find keypoints by ALIKED, which describes all of them at once, and at but one scale."""
+    assert options.aliked_model is not None
+    network = _load("ALIKED", options.aliked_model, _aliked_parameters(options.aliked_size))
+    try:
+        keypoints, descriptors = network.detectAndCompute(cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR), None)
+    except cv2.error as error:
+        raise InputError(f"{options.aliked_model}: not an ALIKED network that OpenCV can run") from error
+    rows = np.array([(*k.pt, k.response) for k in keypoints], dtype=np.float64).reshape(-1, 3)
+    if descriptors is None:
+        descriptors = np.zeros((0, network.descriptorSize()))
+    points, response, ones = rows[:, :2], rows[:, 2], np.ones(len(rows))
+    features = Features(
+        points, np.asarray(descriptors, np.float32), ones, np.zeros(len(rows)), response, None, kind="aliked"
+    )
+    return Detection(points, ones, response, features.take)
 
 
 class LightGlue:

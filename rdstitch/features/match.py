@@ -28,10 +28,9 @@ def match(
 ) -> Correspondences:
     """Match the features of two images, which are of the same kind.
 
-    A match is the nearest neighbour in both directions, and in both directions nearer than ``ratio`` times the second
-    nearest (1 keeps all mutual nearest neighbours). Exchanging the images exchanges the columns of the result. A tie
-    for the nearest is no match. Where features have signs of the Laplacian, only equal signs match. Keypoints at one
-    location (SIFT's several orientations) count as one, and give one match at most. One block of distances takes
+    A match is the nearest neighbour in both directions, and in both nearer than ``ratio`` times the second nearest (1
+    keeps all mutual nearest neighbours); a tie is none. Where features have signs of the Laplacian, only equal signs
+    match. Keypoints at one location (SIFT's several orientations) count as one. A block of distances takes
     ``block_bytes``; the result is the same for any, and for any number of threads.
     """
     limit = check_ratio(ratio)

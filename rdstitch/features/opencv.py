@@ -1,9 +1,8 @@
 """The detectors that OpenCV brings, in the steps that all detectors take: find, choose, describe."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from operator import attrgetter
-from typing import Any, Self, cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.features.keypoints import Descriptors, Features
+from rdstitch.features.keypoints import Descriptors, Detection, Features
 from rdstitch.options.feature_options import FeatureOptions
 from rdstitch.system.process_memory import scratch_memory
 
@@ -29,68 +28,40 @@ _MIN_IMAGE = 16
 _SCRATCH_OF_A_PIXEL = 230
 
 
-@dataclass(frozen=True, eq=False)
-class OpenCVDetection:
-    """Keypoints that an OpenCV detector found in an image."""
+def detect_opencv(grey: Grey, options: FeatureOptions, octaves: Sequence[int] | None = None) -> Detection:
+    """Find keypoints, all or those of some octaves as OpenCV packs them; see :func:`create_detector` for errors."""
+    detector, kind = create_detector(options), options.kind
+    with scratch_memory(_SCRATCH_OF_A_PIXEL * grey.size):
+        keypoints = detector.detect(grey, None) if min(grey.shape) >= _MIN_IMAGE else ()
+    table = _table(keypoints, "size", "angle", "octave", "response")
+    # OpenCV promises no order: sort, so that the choice among equals is the same everywhere.
+    order = np.lexsort(table.T)
+    if octaves is not None:
+        order = order[np.isin(table[order, 4].astype(np.intp) & 255, octaves)]
+    table, ordered = table[order], [keypoints[i] for i in order]
 
-    detector: Any
-    grey: Grey
-    keypoints: list[cv2.KeyPoint]
-    points: FloatArray
-    scale: FloatArray
-    response: FloatArray
-    kind: str
-
-    @classmethod
-    def find(cls, grey: Grey, options: FeatureOptions) -> Self:
-        """Find keypoints; see :func:`create_detector` for errors."""
-        detector = create_detector(options)
+    def describe(chosen: NDArray[np.intp]) -> Features:
+        """Those too near the border for OpenCV drop out."""
+        wanted = [ordered[i] for i in chosen]
         with scratch_memory(_SCRATCH_OF_A_PIXEL * grey.size):
-            keypoints = detector.detect(grey, None) if min(grey.shape) >= _MIN_IMAGE else ()
-        table = _table(keypoints, "size", "angle", "octave", "response")
-        # OpenCV promises no order: sort, so that the choice among equals is the same everywhere.
-        order = np.lexsort(table.T)
-        table = table[order]
-        return cls(
-            detector,
-            grey,
-            [keypoints[i] for i in order],
-            points=table[:, :2],
-            scale=table[:, 2],
-            response=_strength(options.kind, table[:, 5], table[:, 2]),
-            kind=options.kind,
-        )
-
-    def take(self, index: NDArray[np.intp]) -> Self:
-        """The keypoints of the given indices, in their order."""
-        return replace(
-            self,
-            keypoints=[self.keypoints[i] for i in index],
-            points=self.points[index],
-            scale=self.scale[index],
-            response=self.response[index],
-        )
-
-    def describe(self, chosen: NDArray[np.intp]) -> Features:
-        """Describe the chosen keypoints; those too near the border for OpenCV drop out."""
-        wanted = [self.keypoints[i] for i in chosen]
-        with scratch_memory(_SCRATCH_OF_A_PIXEL * self.grey.size):
-            described, descriptors = self.detector.compute(self.grey, wanted) if wanted else ((), None)
+            described, descriptors = detector.compute(grey, wanted) if wanted else ((), None)
         if descriptors is None:
-            dtype = np.float32 if self.detector.descriptorType() == cv2.CV_32F else np.uint8
-            descriptors = np.zeros((0, self.detector.descriptorSize()), dtype)
+            dtype = np.float32 if detector.descriptorType() == cv2.CV_32F else np.uint8
+            descriptors = np.zeros((0, detector.descriptorSize()), dtype)
         table = _table(described, "size", "angle", "response")
         points, (size, degrees, response) = table[:, :2].copy(), table[:, 2:].T
         return Features(
             points=points,
-            descriptors=to_rootsift(descriptors) if self.kind == "rootsift" else cast(Descriptors, descriptors),
+            descriptors=to_rootsift(descriptors) if kind == "rootsift" else cast(Descriptors, descriptors),
             scale=size,
             # OpenCV marks "no orientation" by -1.
             angle=np.where(degrees < 0, 0.0, np.radians(degrees) % (2 * np.pi)),
-            response=_strength(self.kind, response, size),
-            laplacian_sign=_laplacian_sign(self.grey, points, size) if self.kind in ("sift", "rootsift") else None,
-            kind=self.kind,
+            response=_strength(kind, response, size),
+            laplacian_sign=_laplacian_sign(grey, points, size) if kind in ("sift", "rootsift") else None,
+            kind=kind,
         )
+
+    return Detection(table[:, :2], table[:, 2], _strength(kind, table[:, 5], table[:, 2]), describe)
 
 
 def _laplacian_sign(grey: Grey, points: FloatArray, size: FloatArray) -> NDArray[np.int8]:

@@ -30,9 +30,9 @@ def overlapping(features1: Features, features2: Features, matches: Correspondenc
     if len(matches) < _MIN_MATCHES or size1 is None or size2 is None:
         return None
     points1, points2 = matches.points1[:_MAX_MATCHES], matches.points2[:_MAX_MATCHES]
-    distance = np.maximum(_distances(points1, points1, size1), _distances(points2, points2, size2))
+    apart = np.maximum(_squared_distances(points1, size1), _squared_distances(points2, size2))
     # Each is the first in its own company.
-    company = np.partition(distance, _SUPPORTING_NEIGHBOURS, axis=1)[:, _SUPPORTING_NEIGHBOURS]
+    company = np.sqrt(np.partition(apart, _SUPPORTING_NEIGHBOURS, axis=1)[:, _SUPPORTING_NEIGHBOURS])
     right = company <= _NEIGHBOURHOOD
     if np.count_nonzero(~right) > _STRAY:
         return None
@@ -54,15 +54,16 @@ def match_overlap(
 
 def _around(features: Features, size: tuple[int, int], points: FloatArray, reach: FloatArray) -> Part:
     """The features in the cells of an image whose centre is within reach of one of the points."""
-    middle = (np.arange(_CELLS) + 0.5) / _CELLS
-    centres = np.stack(np.meshgrid(middle * size[0], middle * size[1]), axis=-1).reshape(-1, 2)
-    covered = np.any(_distances(centres, points, size) < reach, axis=1)
+    middle, diagonal = (np.arange(_CELLS) + 0.5) / _CELLS, np.hypot(*size)
+    across, down = (
+        np.subtract.outer(middle * length / diagonal, points[:, k] / diagonal) ** 2 for k, length in enumerate(size)
+    )
+    covered = (down[:, None] + across < reach**2).any(axis=-1)
     column, row = np.clip(features.points / size * _CELLS, 0, _CELLS - 1).astype(np.intp).T
-    return np.flatnonzero(covered[row * _CELLS + column])
+    return np.flatnonzero(covered[row, column])
 
 
-def _distances(points: FloatArray, others: FloatArray, size: tuple[int, int]) -> FloatArray:
-    """Between all points (N, 2) and all others (M, 2), diagonals of the image, (N, M)."""
-    points, others = (each / np.hypot(*size) for each in (points, others))
-    across, down = (np.subtract.outer(points[:, k], others[:, k]) for k in (0, 1))
-    return np.asarray(np.sqrt(across**2 + down**2), dtype=np.float64)
+def _squared_distances(points: FloatArray, size: tuple[int, int]) -> FloatArray:
+    """Between all points (N, 2), squared diagonals of the image, (N, N)."""
+    x, y = (points / np.hypot(*size)).T
+    return np.asarray(np.subtract.outer(x, x) ** 2 + np.subtract.outer(y, y) ** 2, dtype=np.float64)

@@ -8,15 +8,15 @@ ones are those of the image at half its size, and so on.
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Self
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.features.keypoints import Features
-from rdstitch.features.opencv import Grey, OpenCVDetection
+from rdstitch.features.keypoints import Detection, Features
+from rdstitch.features.opencv import Grey, detect_opencv
 from rdstitch.options.feature_options import FeatureOptions
 
 LARGE = 1_250_000
@@ -28,76 +28,40 @@ _SIDE = 640  # pixels of a tile without its overlap, at most
 _OVERLAP = 64
 _UPSAMPLED, _FIRST = 255, 0  # octaves -1 and 0, as OpenCV packs them
 
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Keypoints of a tile."""
-
-    detection: OpenCVDetection
-    corner: NDArray[np.intp]  # (2,): of the tile, pixels of the reduced image that it is cut from
-    factor: FloatArray  # (2,): pixels of the image itself for one of the reduced one, horizontally and vertically
-
-    @property
-    def points(self) -> FloatArray:
-        """Places in the whole image, pixels."""
-        return self._in_whole(self.detection.points)
-
-    @property
-    def enlargement(self) -> float:
-        """Pixels of the image itself for one of the reduced one, in the mean of both directions."""
-        return float(np.sqrt(self.factor.prod()))
-
-    def describe(self, chosen: NDArray[np.intp]) -> Features:
-        """Features in pixels of the whole image."""
-        features = self.detection.describe(chosen)
-        return replace(
-            features,
-            points=self._in_whole(features.points),
-            scale=features.scale * self.enlargement,
-            response=features.response * self.enlargement,
-        )
-
-    def _in_whole(self, points: FloatArray) -> FloatArray:
-        return (points + self.corner + 0.5) * self.factor - 0.5
+_Keypoints = TypeVar("_Keypoints", Detection, Features)
 
 
-@dataclass(frozen=True, eq=False)
-class SiftTilesDetection:
-    """Keypoints of an image, found in parts of it."""
+def detect_sift_in_tiles(grey: Grey, options: FeatureOptions) -> Detection:
+    """Find keypoints by SIFT in parts of an image, and describe them part by part."""
+    parts = list(_parts(grey, options))
+    stops = np.cumsum([len(part.points) for part in parts]).tolist()
 
-    parts: tuple[_Part, ...]
+    def describe(chosen: NDArray[np.intp]) -> Features:
+        ranges = zip(parts, [0, *stops[:-1]], stops, strict=True)
+        inside = ((part, start, (chosen >= start) & (chosen < stop)) for part, start, stop in ranges)
+        return Features.concatenate([part.describe(chosen[mask] - start) for part, start, mask in inside])
 
-    @classmethod
-    def find(cls, grey: Grey, options: FeatureOptions) -> Self:
-        """Find the keypoints of an image by SIFT."""
-        return cls(tuple(_parts(grey, options)))
-
-    @property
-    def points(self) -> FloatArray:
-        """Places, pixels of the image, (N, 2)."""
-        return np.concatenate([part.points for part in self.parts])
-
-    @property
-    def scale(self) -> FloatArray:
-        """Diameters, pixels, (N,)."""
-        return np.concatenate([part.enlargement * part.detection.scale for part in self.parts])
-
-    @property
-    def response(self) -> FloatArray:
-        """Strengths, (N,): contrast times diameter, as of an image that is taken whole."""
-        return np.concatenate([part.enlargement * part.detection.response for part in self.parts])
-
-    def describe(self, chosen: NDArray[np.intp]) -> Features:
-        """Describe the chosen keypoints, part by part."""
-        stops = np.cumsum([len(part.detection.points) for part in self.parts])
-        features = []
-        for part, stop in zip(self.parts, stops, strict=True):
-            start = stop - len(part.detection.points)
-            features.append(part.describe(chosen[(chosen >= start) & (chosen < stop)] - start))
-        return Features.concatenate(features)
+    columns = zip(*((part.points, part.scale, part.response) for part in parts), strict=True)
+    points, scale, response = map(np.concatenate, columns)
+    return Detection(points, scale, response, describe)
 
 
-def _parts(grey: Grey, options: FeatureOptions) -> Iterator[_Part]:
+def _in_whole(part: Detection, corner: NDArray[np.intp], factor: FloatArray) -> Detection:
+    """Keypoints of a tile in pixels of the image itself, of which ``factor`` (2,) are one of the tile.
+
+    ``corner`` (2,) is the tile's in the image that it is cut from. Strengths are contrast times diameter.
+    """
+    enlargement = float(np.sqrt(factor.prod()))
+
+    def moved(found: _Keypoints) -> _Keypoints:
+        points = (found.points + corner + 0.5) * factor - 0.5
+        scale, response = found.scale * enlargement, found.response * enlargement
+        return replace(found, points=points, scale=scale, response=response)
+
+    return moved(replace(part, describe=lambda chosen: moved(part.describe(chosen))))
+
+
+def _parts(grey: Grey, options: FeatureOptions) -> Iterator[Detection]:
     """The finest octaves in tiles of the image, and of its halves while these are large; then the rest."""
     whole = np.array(grey.shape[::-1])
     octaves = [_UPSAMPLED, _FIRST]
@@ -109,20 +73,17 @@ def _parts(grey: Grey, options: FeatureOptions) -> Iterator[_Part]:
         grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         if grey.size <= LARGE:
             break
-    detection = OpenCVDetection.find(grey, options)
-    coarse = np.flatnonzero(_octave(detection) != _UPSAMPLED)
-    yield _Part(detection.take(coarse), np.zeros(2, dtype=np.intp), whole / grey.shape[::-1])
+    coarse = detect_opencv(grey, options, range(_UPSAMPLED))
+    yield _in_whole(coarse, np.zeros(2, dtype=np.intp), whole / grey.shape[::-1])
 
 
-def _tiles(grey: Grey, factor: FloatArray, octaves: list[int], options: FeatureOptions) -> Iterator[_Part]:
+def _tiles(grey: Grey, factor: FloatArray, octaves: list[int], options: FeatureOptions) -> Iterator[Detection]:
     """Find the keypoints of some octaves, tile by tile."""
     for y in _intervals(grey.shape[0]):
         for x in _intervals(grey.shape[1]):
-            detection = OpenCVDetection.find(grey[y.seen, x.seen], options)
-            inside = (
-                x.owns(detection.points[:, 0]) & y.owns(detection.points[:, 1]) & np.isin(_octave(detection), octaves)
-            )
-            yield _Part(detection.take(np.flatnonzero(inside)), np.array([x.seen.start, y.seen.start]), factor)
+            detection = detect_opencv(grey[y.seen, x.seen], options, octaves)
+            inside = x.owns(detection.points[:, 0]) & y.owns(detection.points[:, 1])
+            yield _in_whole(detection.take(np.flatnonzero(inside)), np.array([x.seen.start, y.seen.start]), factor)
 
 
 @dataclass(frozen=True)
@@ -151,8 +112,3 @@ def _intervals(length: int) -> list[_Interval]:
         )
         for start, stop in pairwise(borders)
     ]
-
-
-def _octave(detection: OpenCVDetection) -> NDArray[np.intp]:
-    """The octave of each keypoint, as OpenCV packs it."""
-    return np.array([keypoint.octave & 255 for keypoint in detection.keypoints], dtype=np.intp)

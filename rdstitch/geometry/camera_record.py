@@ -1,6 +1,7 @@
 """The camera as a record: its own files, which sidecars and the files of other programs hold too."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
@@ -83,17 +84,13 @@ class CameraRecord(LensRecord):
             distortion_std=self.lambda_std,
             lens_covariance=self.lens_covariance,
             focal_std=self.focal_std_px,
-            tilt=_radians(self.tilt_deg),
-            tilt_std=_radians(self.tilt_std_deg),
+            tilt=_converted(math.radians, self.tilt_deg),
+            tilt_std=_converted(math.radians, self.tilt_std_deg),
         )
 
 
-def _radians(angles: Pair | None) -> Pair | None:
-    return None if angles is None else (math.radians(angles[0]), math.radians(angles[1]))
-
-
-def _degrees(angles: Pair | None) -> Pair | None:
-    return None if angles is None else (math.degrees(angles[0]), math.degrees(angles[1]))
+def _converted(convert_angle: Callable[[float], float], angles: Pair | None) -> Pair | None:
+    return None if angles is None else (convert_angle(angles[0]), convert_angle(angles[1]))
 
 
 def lens_fields(camera: Camera) -> dict[str, Any]:
@@ -123,8 +120,8 @@ def camera_record(camera: Camera) -> CameraRecord:
         lambda_px=camera.distortion_px,
         lambda_focal=camera.distortion_focal,
         focal_std_px=camera.focal_std,
-        tilt_deg=_degrees(camera.tilt),
-        tilt_std_deg=_degrees(camera.tilt_std),
+        tilt_deg=_converted(math.degrees, camera.tilt),
+        tilt_std_deg=_converted(math.degrees, camera.tilt_std),
         **lens_fields(camera),
     )
 

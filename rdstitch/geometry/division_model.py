@@ -44,14 +44,14 @@ _NEAREST_STEPS, _NEAREST_TOLERANCE = 20, 1e-13
 
 def divisor(radius2: FloatArray, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
     """``g`` at squared radii of measured points; λ broadcasts, ``higher`` are μ and ν."""
-    tail = _horner(higher, radius2)
+    tail = horner(higher, radius2)
     result: FloatArray = 1.0 + (np.asarray(distortion) + tail) * radius2
     return result
 
 
 def divisor_slope(radius2: FloatArray, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
     """Derivative of ``g`` by the squared radius: ``λ + 2 μ q + 3 ν q²``."""
-    result: FloatArray = np.asarray(distortion) + _horner([(k + 2) * c for k, c in enumerate(higher)], radius2)
+    result: FloatArray = np.asarray(distortion) + horner([(k + 2) * c for k, c in enumerate(higher)], radius2)
     return result
 
 
@@ -193,7 +193,7 @@ def nearest_one_parameter(radius2: FloatArray, distortion: float, higher: Sequen
     return nearest, scale
 
 
-def _horner(coefficients: Sequence[float], q: FloatArray) -> FloatArray | float:
+def horner(coefficients: Sequence[float], q: FloatArray) -> FloatArray | float:
     """``c1 q + c2 q² + …``."""
     total: FloatArray | float = 0.0
     for coefficient in reversed(coefficients):

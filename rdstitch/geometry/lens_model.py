@@ -4,13 +4,13 @@ Each is a *forward* map: pixels of a lens without distortion and with square pix
 :class:`rdstitch.geometry.camera.Camera` whose coefficients come close to it.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
+from rdstitch.geometry.division_model import horner
 
 _NEWTON_STEPS, _NEWTON_TOLERANCE = 20, 1e-10
 
@@ -83,20 +83,12 @@ class LensModel:
         if self.kind != "brown":
             radius = np.sqrt((points * points).sum(axis=-1, keepdims=True))
             ideal = radius if self.kind == "polynomial" else np.arctan(radius)
-            bent = ideal * _series(self.coefficients, ideal**2 if self.fisheye else ideal)
+            bent = ideal * (1.0 + horner(self.coefficients, ideal**2 if self.fisheye else ideal))
             inside = radius == 0.0
             return np.asarray(points * np.where(inside, 1.0, bent / np.where(inside, 1.0, radius)))
         k1, k2, p1, p2, k3, *below = (*self.coefficients, *[0.0] * (8 - len(self.coefficients)))
         x, y = np.moveaxis(points, -1, 0)
         r2 = x * x + y * y
-        ratio = _series((k1, k2, k3), r2) / _series(below, r2)
+        ratio = np.asarray((1.0 + horner((k1, k2, k3), r2)) / (1.0 + horner(below, r2)))
         tangential = [2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x), p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y]
         return np.asarray(points * ratio[..., None] + np.stack(tangential, axis=-1))
-
-
-def _series(coefficients: Sequence[float], powers: FloatArray) -> FloatArray:
-    """``1 + c1 s + c2 s² + …``."""
-    total = np.zeros_like(powers)
-    for coefficient in reversed(coefficients):
-        total = (total + coefficient) * powers
-    return 1.0 + total

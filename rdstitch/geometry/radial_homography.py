@@ -189,11 +189,10 @@ def transfer_jacobian(
 def measurement_whitening(by_point: FloatArray, common: FloatArray | None = None) -> FloatArray:
     """Whitening of a transfer error whose noise comes from both images (Sampson's weighting).
 
-    A point measured with the same noise in both images is transferred with covariance ``I + J J'``, ``J`` =
-    ``by_point``. The returned upper triangular ``W`` has ``W'W = ((I + J J') / 2)⁻¹``, so that the whitened error has
-    the size of the error in one image where the two have the same scale. ``by_point`` (N, 2, 2) is the derivative of
-    the transferred by the original point, both in pixels; ``common`` (N, 2) a random displacement of the transferred
-    point besides, of one standard deviation, over that of the noise: its square is added to the covariance.
+    A point measured with the same noise in both images is transferred with covariance ``I + J J'``, J = ``by_point``
+    (N, 2, 2) the derivative of the transferred by the original point, both in pixels. The upper triangular ``W`` has
+    ``W'W = ((I + J J') / 2)⁻¹``: of the size of the error in one image. ``common`` (N, 2), a random displacement of the
+    transferred point of one standard deviation, over that of the noise, is added to the covariance squared.
     """
     (ax, ay), (bx, by) = by_point.transpose(1, 2, 0)
     xx, yy, xy = (1.0 + ax * ax + ay * ay) / 2.0, (1.0 + bx * bx + by * by) / 2.0, (ax * bx + ay * by) / 2.0

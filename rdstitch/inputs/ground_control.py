@@ -15,7 +15,7 @@ from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.inputs.positions import COLUMNS, UNITS, accuracy_of, geographic_places
 from rdstitch.inputs.rows_of_images import ImagesByName
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import Row, csv_rows
+from rdstitch.inputs.tables import Row, csv_rows, numbered_lines
 from rdstitch.system.file_access import read_text
 
 _ACCURACIES = {name: aliases for name, aliases in COLUMNS.items() if name.endswith("std")}
@@ -104,14 +104,11 @@ def _marks(rows: Iterable[Row], sources: Sequence[Source]) -> list[_Mark]:
 
 def _opendronemap(text: str, file: str) -> Iterator[Row]:
     """The lines of a ``gcp_list.txt`` below its coordinate system; what follows the numbers is an image and a point."""
-    for number, line in enumerate(text.splitlines(), start=1):
+    for where, line in numbered_lines(text, file):
         fields = line.split(maxsplit=5)
-        if not fields or fields[0].startswith("#"):
-            continue
-        row = Row(f"{file}: line {number}", dict(zip(_CONTROL_LISTED, fields, strict=False)), ".")
         if len(fields) < 6:
-            raise InputError(f"{row.where}: expected X Y Z PX PY IMAGE [NAME]")
-        yield row
+            raise InputError(f"{where}: expected X Y Z PX PY IMAGE [NAME]")
+        yield Row(where, dict(zip(_CONTROL_LISTED, fields, strict=True)), ".")
 
 
 def _images_and_point(row: Row, names: ImagesByName) -> tuple[list[int], str]:

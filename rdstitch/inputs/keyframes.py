@@ -9,13 +9,14 @@ and an affine motion that is fitted to them.
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.features.corner_flow import CornerFlow, corners_of, fitted_affine
+from rdstitch.features.corner_flow import CornerFlow, corners_of
 from rdstitch.features.prepared_image import PreparedImage
 from rdstitch.results.messages import Message
 
@@ -78,6 +79,22 @@ def _motion(before: FloatArray, now: FloatArray, side: int, count: int) -> tuple
         return None, True
     way = float(np.median(np.linalg.norm(now - before, axis=1)))
     return np.vstack([motion, [0.0, 0.0, 1.0]]), len(now) < _RENEWED_FROM * count or way > _RENEWED_FROM * side / 2
+
+
+def fitted_affine(target: FloatArray, source: FloatArray, threshold: float) -> tuple[FloatArray | None, BoolArray]:
+    """Fit the affine motion (2, 3) that brings most points (N, 2) to others, and mark those (N,)."""
+    known = np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1)
+    inliers = np.zeros(len(source), dtype=np.bool_)
+    if known.sum() < 3:
+        return None, inliers
+    estimate: Any = cv2.estimateAffine2D(
+        source[known], target[known], method=cv2.RANSAC, ransacReprojThreshold=threshold
+    )
+    motion, agree = estimate
+    if motion is None:
+        return None, inliers
+    inliers[known] = agree[:, 0] > 0
+    return np.asarray(motion, dtype=np.float64), inliers
 
 
 def _small(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.geometry.crs import WGS84, Crs, load_pyproj, transformed
-from rdstitch.geometry.utm import epsg_of
+from rdstitch.geometry.crs import WGS84, Crs, epsg_of, load_pyproj, transformed
 
 _PLAIN_TERMS = {"datum": ("WGS84",), "ellps": ("WGS84",), "units": ("m",), "no_defs": ("",), "type": ("crs",)}
 """Terms of PROJ that leave a system one on WGS 84 in metres."""

@@ -11,13 +11,14 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
-from rdstitch.inputs.tables import TIME_NAMES, csv_rows, is_number
+from rdstitch.inputs.tables import TIME_NAMES, Row, csv_rows, is_number, numbered_lines
 from rdstitch.system.file_access import cached_by_file_state, read_text
 
 _COLUMNS = {"timestamp": TIME_NAMES} | {
     name: name.replace("_", "")
     for name in ("x", "y", "yaw", "yaw_deg", "qx", "qy", "qz", "qw", "cov_x_x", "cov_y_y", "cov_yaw_deg_yaw_deg")
 }
+_LISTED = ("timestamp", "x", "y", "z", "qx", "qy", "qz", "qw")  # in TUM's lines
 _SLIP = 0.02  # share of distances and turns that wheels are off by if they do not say
 
 
@@ -72,20 +73,14 @@ def read_odometry(file: str | Path) -> Odometry:
     yaw it may have a quaternion.
     """
     text, where = read_text(file), str(file)
-    first = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
-    if len(first.split()) == 8 and all(is_number(part) for part in first.split()):
-        rows = []
-        for number, line in enumerate(text.splitlines(), start=1):
-            if line.strip() and not line.startswith("#"):
-                parts = line.split()
-                if len(parts) != 8 or not all(map(is_number, parts)):
-                    raise InputError(f"{file}: line {number}: expected timestamp tx ty tz qx qy qz qw, found '{line}'")
-                time, x, y, _, qx, qy, qz, qw = map(float, parts)
-                rows.append((time, x, y, yaw_of(qx, qy, qz, qw), math.nan, math.nan))
-        return odometry_of(rows, where)
-    wanted = ("timestamp,x,y,yaw_deg", "timestamp,x,y,yaw", "timestamp,x,y,qx,qy,qz,qw")
+    lines = numbered_lines(text, where)
+    if lines and is_number(lines[0][1].split()[0]) and len(lines[0][1].split()) == len(_LISTED):
+        rows = [_listed_pose(*line) for line in lines]
+    else:
+        wanted = ("timestamp,x,y,yaw_deg", "timestamp,x,y,yaw", "timestamp,x,y,qx,qy,qz,qw")
+        rows = csv_rows(text, where, _COLUMNS, wanted, ("s", "m", "deg", "rad"))
     table = []
-    for row in csv_rows(text, where, _COLUMNS, wanted, ("s", "m", "deg", "rad")):
+    for row in rows:
         yaw = row.number("yaw")
         if yaw is None and (degrees := row.number("yaw_deg")) is not None:
             yaw = math.radians(degrees)
@@ -96,6 +91,13 @@ def read_odometry(file: str | Path) -> Odometry:
         turned = math.nan if turn is None else math.radians(math.sqrt(max(turn, 0.0))) ** 2
         table.append((row.needed("timestamp"), row.needed("x"), row.needed("y"), yaw, place, turned))
     return odometry_of(table, where)
+
+
+def _listed_pose(where: str, line: str) -> Row:
+    parts = line.split()
+    if len(parts) != len(_LISTED) or not all(map(is_number, parts)):
+        raise InputError(f"{where}: expected timestamp tx ty tz qx qy qz qw, found '{line}'")
+    return Row(where, dict(zip(_LISTED, parts, strict=True)), ".")
 
 
 def odometry_of(rows: Sequence[tuple[float, ...]], where: str) -> Odometry:

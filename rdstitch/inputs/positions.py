@@ -109,7 +109,7 @@ def _places(sources: Sequence[Source], file: str | Path, epsg: int | None, offse
         if text.lstrip().startswith(("[", "{")):
             rows = json_rows(text, name, COLUMNS, _RECORDS)
         elif (named := NamedSystem.named_by(lines[0])) is not None:
-            rows, system = listed_rows("".join(lines[1:]).splitlines(), name, _LISTED, 2), named
+            rows, system = listed_rows("".join(lines[1:]), name, _LISTED, 2), named
         else:
             rows = csv_rows(text, name, COLUMNS, _WANTED, UNITS)
         named_rows = RowsByImage(row for row in rows if _coordinates(row) is not None)

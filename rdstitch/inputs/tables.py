@@ -145,15 +145,20 @@ def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> 
     )
 
 
-def listed_rows(lines: Iterable[str], file: str, columns: Sequence[str], first_line: int = 1) -> list[Row]:
-    """Lines of a name, which may hold blanks, and numbers between blanks; those that begin with ``#`` are ignored."""
+def numbered_lines(text: str, file: str, first: int = 1) -> list[tuple[str, str]]:
+    """Where each line is, for messages, and what it says, but for empty ones and those that begin with ``#``."""
+    lines = ((f"{file}: line {n}", line.strip()) for n, line in enumerate(text.splitlines(), start=first))
+    return [(where, line) for where, line in lines if line and not line.startswith("#")]
+
+
+def listed_rows(text: str, file: str, columns: Sequence[str], first_line: int = 1) -> list[Row]:
+    """Lines of a name, which may hold blanks, and numbers between blanks; see :func:`numbered_lines`."""
     rows = []
-    for number, line in enumerate(lines, start=first_line):
+    for where, line in numbered_lines(text, file, first_line):
         fields = line.split()
-        if fields and not fields[0].startswith("#"):
-            count = len(list(takewhile(_readings, reversed(fields[1:]))))
-            name = line.strip().rsplit(maxsplit=count)[0]
-            rows.append((f"{file}: line {number}", zip(columns, (name, *fields[len(fields) - count :]), strict=False)))
+        count = len(list(takewhile(_readings, reversed(fields[1:]))))
+        name = line.rsplit(maxsplit=count)[0]
+        rows.append((where, zip(columns, (name, *fields[len(fields) - count :]), strict=False)))
     return _rows(rows)
 
 

@@ -12,7 +12,7 @@ from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame, frame_numbers
 from rdstitch.inputs.rows_of_images import RowsByImage
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, csv_rows, is_number
+from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, csv_rows, is_number, numbered_lines
 from rdstitch.system.file_access import cached_by_file_state, read_text
 
 _COLUMNS = {"name": IMAGE_NAMES, "timestamp": TIME_NAMES}
@@ -76,19 +76,18 @@ def _times(frames: Sequence[Frame], named: RowsByImage, file: str | Path) -> lis
 @cached_by_file_state
 def _read_times(file: str | Path) -> list[float] | RowsByImage:
     """The times in order, or by the names of images."""
-    text, where = read_text(file), str(file)
-    lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1)]
-    lines = [(n, line) for n, line in lines if line and not line.startswith("#")]
+    text = read_text(file)
+    lines = numbered_lines(text, str(file))
     if lines and all(is_number(line) for _, line in lines):
         return [float(line) for _, line in lines]
     if not lines or not is_number(lines[0][1].split()[0]):
-        rows = csv_rows(text, where, _COLUMNS, ("name,timestamp",), ("s",))
+        rows = csv_rows(text, str(file), _COLUMNS, ("name,timestamp",), ("s",))
     else:
         rows = []
-        for number, line in lines:
+        for where, line in lines:
             time, name = (*line.split(maxsplit=1), "")[:2]
             if not name or not is_number(time):
                 wanted = f"a table with the columns {','.join(_COLUMNS)}, lines TIMESTAMP NAME, or one time a line"
-                raise InputError(f"{file}: line {number}: found '{line}'; give {wanted}")
-            rows.append(Row(f"{file}: line {number}", {"name": name, "timestamp": time}, "."))
+                raise InputError(f"{where}: found '{line}'; give {wanted}")
+            rows.append(Row(where, {"name": name, "timestamp": time}, "."))
     return RowsByImage(rows)

@@ -160,6 +160,11 @@ def factorized(matrix: Any) -> Any:
     return sparse_linalg.splu(sparse.csc_array(matrix), **symmetric)
 
 
+def interpolation(nodes: NDArray[np.intp], shares: FloatArray, count: int) -> "sparse.csr_array":
+    """From values at ``count`` nodes to those at places between four of them (N, 4), which have these shares."""
+    return sparse.csr_array((shares.ravel(), nodes.ravel(), np.arange(0, nodes.size + 1, 4)), shape=(len(nodes), count))
+
+
 def _coarser(shapes: Shapes, cameras: Sequence[Camera], cells: int) -> "sparse.csr_array | None":
     """From values at the nodes of grids of half as many cells to those of all images; None where these are few."""
     if cells < _MIN_HALVED or _first_nodes(shapes)[-1] <= _FACTORIZED:
@@ -168,10 +173,8 @@ def _coarser(shapes: Shapes, cameras: Sequence[Camera], cells: int) -> "sparse.c
     for shape, camera in zip(shapes, cameras, strict=True):
         if (size := camera.image_size) not in parts:
             few = grid_shape(size, cells // 2)
-            nodes, shares = bilinear(node_points(size, shape), size, few)
-            ends = np.arange(0, nodes.size + 1, 4)
-            parts[size] = sparse.csr_array((shares.ravel(), nodes.ravel(), ends), shape=(len(nodes), few[0] * few[1]))
-    return sparse.block_diag([parts[camera.image_size] for camera in cameras], format="csr")
+            parts[size] = interpolation(*bilinear(node_points(size, shape), size, few), few[0] * few[1])
+    return sparse.csr_array(sparse.block_diag([parts[camera.image_size] for camera in cameras]))
 
 
 def _expected(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.local_alignment.field import grid_shape, node_points, nodes_around
-from rdstitch.local_alignment.fit import PlacedFields, Reweighting, Stiffness, factorized, smoothness
+from rdstitch.local_alignment.fit import PlacedFields, Reweighting, Stiffness, factorized, interpolation, smoothness
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches
 from rdstitch.system.late_imports import sparse
 
@@ -43,17 +43,13 @@ class Ground:
         """Nodes (M, 4) around places (M, 2) and their weights (M, 4)."""
         return nodes_around((places - self.origin) / self.spacing, self.heights.shape)
 
-    def at(self, places: FloatArray) -> FloatArray:
-        """Heights (M,) at places (M, 2)."""
-        nodes, weights = self.nodes(places)
-        return np.asarray((self.heights.ravel()[nodes] * weights).sum(axis=-1))
-
     def fields(self, images: ImagesOnSurface, stiffness: Stiffness) -> PlacedFields:
         """How far it displaces what each image shows."""
         shapes, values = tuple(grid_shape(camera.image_size, stiffness.cells) for camera in images.cameras), []
         for k, (camera, shape) in enumerate(zip(images.cameras, shapes, strict=True)):
             places = np.nan_to_num(images.to_surface(k, node_points(camera.image_size, shape)))
-            height = self.at(places)[:, None]
+            nodes, weights = self.nodes(places)
+            height = (self.heights.ravel()[nodes] * weights).sum(axis=-1, keepdims=True)
             values.append((places - self.centers[k, :2]) * (height / (self.centers[k, 2] - height)))
         return PlacedFields(images, stiffness, shapes, tuple(values))
 
@@ -73,13 +69,11 @@ def fit_ground(matches: PlacedMatches, images: ImagesOnSurface, centers: FloatAr
         places = ((matches.places + ratio * below) / (1.0 + ratio)).mean(axis=1)
         by_height = (places[:, None] - below) / (above - height)  # displacement in either image of a unit of height
         parallax = by_height[:, 0] - by_height[:, 1]
-        nodes, weights = ground.nodes(places)
-        rows = np.arange(0, nodes.size + 1, 4)
-        design = sparse.csr_array((weights.ravel(), nodes.ravel(), rows), shape=(len(nodes), ground.heights.size))
+        design = interpolation(*ground.nodes(places), ground.heights.size)
         weighted = sparse.csr_array(design.T * (weight * (parallax**2).sum(axis=1)))
         right = design.T @ (weight * (parallax * matches.residual).sum(axis=1))
         solved = np.minimum(factorized(weighted @ design + prior).solve(right), highest)
         ground = replace(ground, heights=solved.reshape(ground.heights.shape))
-        height = ground.at(places)[:, None, None]
+        height = (design @ solved)[:, None, None]
         left = matches.residual - parallax * height[:, 0]
     return ground

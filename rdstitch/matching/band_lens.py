@@ -10,36 +10,22 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.errors import InputError
+from rdstitch.features.patch_shifts import Edges, coarse_shift, edges_of, patch_shifts
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.inputs.source import Source
-from rdstitch.results.messages import Message
 from rdstitch.system.late_imports import optimize
 
 _MAX_IMAGES = 8  # that are compared
-_COARSE_SIDE = 512  # pixels
-_PATCHES = 5  # along the longer side
 _AGREEING = 0.002  # diagonals of the image: patches that show a common shift
 _ENOUGH = 0.3  # of the patches must agree for a shift to be one
 _WORTH_CORRECTING = 0.2  # pixels: the error of a patch
 _ELSEWHERE = 0.01  # diagonals between images of one flight: parallax, and triggers that are not quite at one time
 _ROUNDS = 3
-
-Grey = NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
-class _Shifts:
-    """Patches of one pair of images."""
-
-    points: FloatArray  # (P, 2): pixels of the registered image
-    others: FloatArray  # (P, 2): where the other image shows the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,18 +41,10 @@ class BandLens:
         """The band's camera beside a registered one."""
         return replace(camera, distortion=camera.distortion + self.distortion)
 
-    @property
-    def message(self) -> Message:
-        """What the user should know of it."""
-        text = (
-            f"{self.shift:.1f} pixels (median) from the registered band, {self.error:.1f} with its lens registered too"
-        )
-        return Message(text, severity="note", code="band-lens")
-
 
 def band_lens(
     pairs: Mapping[int, tuple[Source, Source]], report: Callable[[int, int], None] = lambda done, total: None
-) -> tuple[BandLens | None, list[Message]]:
+) -> BandLens | None:
     """The lens of a band from registered images and those that take their place, by numbers; None where it is the same.
 
     Where the images show nothing in common, as masks do, nothing is known, and nothing changed. Raises InputError where
@@ -76,23 +54,23 @@ def band_lens(
     compared = [list(pairs.values())[k] for k in chosen]
     compared = [pair for pair in compared if pair[0].camera.image_size == pair[1].camera.image_size]
     if not compared:
-        return None, []
+        return None
     edges = []
     for done, pair in enumerate(compared):
         report(done, len(compared))
-        edges.append((_edges(pair[0]), _edges(pair[1])))
-    coarse = [_coarse_shift(*each) for each in edges]
+        edges.append((edges_of(pair[0].read().pixels), edges_of(pair[1].read().pixels)))
+    coarse = [coarse_shift(*each) for each in edges]
     _refuse_other_places(compared, edges, coarse)
     expected: Callable[[FloatArray], FloatArray] = partial(np.add, np.median(coarse, axis=0))
     camera = compared[0][0].camera
     found = BandLens(np.eye(3), 0.0, 0.0, 0.0)
     for _ in range(_ROUNDS):
-        shifts = [_patch_shifts(*each, expected) for each in edges]
+        shifts = [patch_shifts(*each, expected) for each in edges]
         fitted = _fit(camera, shifts)
         if fitted is None:
-            return None, []
+            return None
         found, expected = fitted, partial(_seen_by_band, camera, fitted.homography, fitted.distortion)
-    return (None, []) if found.shift < max(_WORTH_CORRECTING, found.error) else (found, [found.message])
+    return None if found.shift < max(_WORTH_CORRECTING, found.error) else found
 
 
 def _seen_by_band(camera: Camera, homography: FloatArray, distortion: float, points: FloatArray) -> FloatArray:
@@ -101,55 +79,9 @@ def _seen_by_band(camera: Camera, homography: FloatArray, distortion: float, poi
     return from_plane(other, np.eye(3), to_plane(camera, homography, points))
 
 
-def _edges(source: Source) -> Grey:
-    """Where the contrast is strong, whatever its sign, of one standard deviation."""
-    pixels = source.read().pixels
-    grey = pixels.astype(np.float32) if pixels.ndim == 2 else pixels[..., :3].mean(axis=2, dtype=np.float32)
-    smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
-    steep = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
-    # The few strongest edges shall not outweigh all others.
-    level = float(np.median(steep)) or float(steep.mean()) or 1.0
-    compressed: Grey = np.log1p(steep / level).astype(np.float32)
-    return compressed
-
-
-def _shift(first: Grey, second: Grey) -> FloatArray:
-    """By how many pixels (x, y) the second shows the same further right and down."""
-    window = cv2.createHanningWindow((first.shape[1], first.shape[0]), cv2.CV_32F)
-    (x, y), _ = cv2.phaseCorrelate(first - first.mean(), second - second.mean(), window)
-    return np.array([x, y])
-
-
-def _coarse_shift(first: Grey, second: Grey) -> FloatArray:
-    factor = min(1.0, _COARSE_SIDE / max(first.shape))
-    size = round(first.shape[1] * factor), round(first.shape[0] * factor)
-    small = [cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (first, second)]
-    moved: FloatArray = _shift(small[0].astype(np.float32), small[1].astype(np.float32)) / factor
-    return moved
-
-
-def _patch_shifts(first: Grey, second: Grey, expected: Callable[[FloatArray], FloatArray]) -> _Shifts:
-    """Patches of the first image, and where the second one shows them, near where that is expected."""
-    height, width = first.shape
-    side = max(32, max(width, height) // _PATCHES // 2 * 2)
-    corners = np.array(
-        [(x, y) for y in range(0, height - side + 1, side // 2) for x in range(0, width - side + 1, side // 2)]
-    )
-    points = corners.astype(np.float64).reshape(-1, 2) + (side - 1) / 2
-    starts = np.rint(expected(points) - points)
-    starts = np.where(np.isfinite(starts), starts, 0.0).astype(np.intp) + corners.reshape(-1, 2)
-    kept, others = [], []
-    for (x, y), (u, v), point in zip(corners.reshape(-1, 2).tolist(), starts.tolist(), points, strict=True):
-        if 0 <= u <= width - side and 0 <= v <= height - side:
-            moved = _shift(first[y : y + side, x : x + side], second[v : v + side, u : u + side])
-            kept.append(point)
-            others.append(point + moved + np.array([u - x, v - y]))
-    return _Shifts(np.array(kept).reshape(-1, 2), np.array(others).reshape(-1, 2))
-
-
-def _fit(camera: Camera, shifts: Sequence[_Shifts]) -> BandLens | None:
-    """The lens that most patches agree with; None where few do."""
-    points, others = (np.concatenate([getattr(each, name) for each in shifts]) for name in ("points", "others"))
+def _fit(camera: Camera, shifts: Sequence[FloatArray]) -> BandLens | None:
+    """The lens that most patches of all images agree with; None where few do."""
+    points, others = np.concatenate(shifts, axis=1)
     if len(points) < 9:
         return None
     near = _AGREEING * math.hypot(*camera.image_size)
@@ -175,20 +107,19 @@ def _fit(camera: Camera, shifts: Sequence[_Shifts]) -> BandLens | None:
 
 
 def _refuse_other_places(
-    compared: Sequence[tuple[Source, Source]], edges: Sequence[tuple[Grey, Grey]], coarse: Sequence[FloatArray]
+    compared: Sequence[tuple[Source, Source]], edges: Sequence[tuple[Edges, Edges]], coarse: Sequence[FloatArray]
 ) -> None:
     """Refuse images that show the same as the registered ones, but each shifted by something else."""
     diagonal = math.hypot(*edges[0][0].shape)
     sure = []
     for (first, second), shift in zip(edges, coarse, strict=True):
-        shifts = _patch_shifts(first, second, partial(np.add, shift))
-        away = np.linalg.norm(shifts.others - shifts.points - shift, axis=1)
+        points, others = patch_shifts(first, second, partial(np.add, shift))
+        away = np.linalg.norm(others - points - shift, axis=1)
         sure.append(len(away) > 0 and float((away < 3.0 * _AGREEING * diagonal).mean()) > _ENOUGH)
-    certain = np.array(sure)
-    if certain.sum() < 2:
+    if sum(sure) < 2:
         return
-    shifts_of = np.array(coarse)
-    off = np.where(certain, np.linalg.norm(shifts_of - np.median(shifts_of[certain], axis=0), axis=1), 0.0)
+    shifts = np.array(coarse)
+    off = np.where(sure, np.linalg.norm(shifts - np.median(shifts[sure], axis=0), axis=1), 0.0)
     worst = int(np.argmax(off))
     if off[worst] > _ELSEWHERE * diagonal:
         registered, given = compared[worst]

@@ -1,11 +1,14 @@
 """Which pairs of images to match, so that the cost does not grow with the square of their number.
 
 Up to :data:`EXHAUSTIVE_UP_TO` images every pair is compared. Beyond, images that follow one another, that were
-taken near each other, and that look alike. Of these, each image is registered with those that matter for its place;
-and once poses are known, with those that the poses put beside it and that close a loop.
+taken near each other, and that look alike. Of these, those that share something by their strongest features alone, and
+that matter for the place of an image; and once poses are known, those that the poses put beside it and that close a
+loop.
 """
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations, islice
 
 import numpy as np
@@ -15,7 +18,9 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import project
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
+from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.retrieval import Similarity, similarity
+from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.system.late_imports import sparse
 
 EXHAUSTIVE_UP_TO = 30
@@ -35,24 +40,25 @@ _CELLS_PER_SIDE = 4  # cells of an image, a side, that its partners are to cover
 
 _PAIRS_AT_ONCE = 1024
 
-Pairs = list[tuple[int, int]]
+_STRONGEST = 500  # features of an image, by which pairs are prescreened
+_MIN_MATCHES = 6  # matches among these; images that share nothing have two to five by chance
+_MIN_RELATIVE_MATCHES = 0.05  # fraction of the matches that an image has with the one most like it; less adds nothing
 
 
-def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None = None) -> Pairs:
+def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None = None) -> list[Pair]:
     """Pairs (i, j), i < j, to try before anything is known of the poses.
 
-    Beyond :data:`EXHAUSTIVE_UP_TO` images, they are at most :data:`CANDIDATES` an image in the mean, unless
-    positions ask for more: images that follow one another where the order means something, those that were taken
-    nearest to each other, a few that each image is most alike to, and those that are most alike of all.
-
-    ``features``: of the images, in the order in which the images were taken, if there is one; ``positions`` (N, 2) or
-    (N, 3): where each image was taken, in any unit; NaN where that is not known.
+    Beyond :data:`EXHAUSTIVE_UP_TO` images, they are images that follow one another where the order means something,
+    those taken nearest to each other by ``positions`` (N, 2 or 3; NaN where not known), a few that each image is most
+    alike to, and those most alike of all, until there are :data:`CANDIDATES` an image in the mean.
     """
     count = len(features)
     if count <= EXHAUSTIVE_UP_TO:
         return list(combinations(range(count), 2))
     alike = similarity(features, seed)
-    chosen = set() if positions is None else _nearest_positions(positions)
+    chosen = set[Pair]()
+    if positions is not None and len(known := np.flatnonzero(np.isfinite(positions).all(axis=1))) > 1:
+        chosen |= _nearest_pairs(positions[known], known, _NEAREST)
     if alike is None or alike.ordered:
         chosen |= {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + _SEQUENCE_NEIGHBOURS, count))}
     if alike is not None:
@@ -63,49 +69,37 @@ def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None 
     return sorted(chosen)
 
 
-def _most_alike(alike: Similarity, chosen: set[tuple[int, int]], total: int) -> set[tuple[int, int]]:
+def _most_alike(alike: Similarity, chosen: set[Pair], total: int) -> set[Pair]:
     """The pairs most alike of all besides those chosen, so many that there are ``total`` of both."""
     scores = sparse.triu(alike.scores, k=1).tocoo()
     best = np.argsort(-scores.data, kind="stable")
     best = best[scores.data[best] > 0.0]
-    others = (pair for pair in zip(scores.row[best].tolist(), scores.col[best].tolist(), strict=True))
-    return set(islice((pair for pair in others if pair not in chosen), max(total - len(chosen), 0)))
+    ranked = zip(scores.row[best].tolist(), scores.col[best].tolist(), strict=True)
+    return set(islice((pair for pair in ranked if pair not in chosen), max(total - len(chosen), 0)))
 
 
-def _nearest_positions(positions: FloatArray) -> set[tuple[int, int]]:
-    """Pairs of images that were taken nearest to each other."""
-    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
-    if len(known) < 2:
-        return set()
-    return _nearest_pairs(positions[known], known, _NEAREST)
-
-
-def _nearest_pairs(places: FloatArray, images: IntArray, most: int) -> set[tuple[int, int]]:
+def _nearest_pairs(places: FloatArray, images: IntArray, most: int) -> set[Pair]:
     """Pairs of images of which one is among the nearest of the other, by their places."""
     nearest = nearest_points(places, places, most + 1)[1]
     pairs = np.sort(np.stack([np.repeat(images, nearest.shape[1]), images[nearest.ravel()]], axis=1), axis=1)
     return {(i, j) for i, j in pairs.tolist() if i != j}
 
 
-def select_pairs(
-    shared: Mapping[tuple[int, int], StoredMatches], cameras: Sequence[Camera]
-) -> dict[tuple[int, int], StoredMatches]:
+def select_pairs(shared: Mapping[Pair, StoredMatches], cameras: Sequence[Camera]) -> dict[Pair, StoredMatches]:
     """Of pairs that share something those that one of their images needs for its place.
 
     An image takes one partner after the other: the one whose matches add most to the sum of the square roots of the
     numbers of matches in its cells. So partners with many matches come first, but rather around the image than
     all on one side of it. Of a survey in which each image overlaps twenty others, a third of the pairs is left.
-
-    ``shared``: some matches of each pair (i, j); ``cameras``: one an image; only their sizes are used.
     """
-    partners: dict[int, list[tuple[tuple[int, int], FloatArray]]] = {}
+    partners = defaultdict[int, list[tuple[Pair, FloatArray]]](list)
     for pair, matches in shared.items():
         matched = matches.load()
         for image, points in zip(pair, (matched.points1, matched.points2), strict=True):
             cell = np.clip(points / cameras[image].image_size * _CELLS_PER_SIDE, 0, _CELLS_PER_SIDE - 1).astype(np.intp)
             counts = np.bincount(cell @ [1, _CELLS_PER_SIDE], minlength=_CELLS_PER_SIDE**2)
-            partners.setdefault(image, []).append((pair, counts.astype(np.float64)))
-    chosen: set[tuple[int, int]] = set()
+            partners[image].append((pair, counts.astype(np.float64)))
+    chosen: set[Pair] = set()
     for choices in partners.values():
         counts, covered = np.array([cells for _, cells in choices]), np.zeros(_CELLS_PER_SIDE**2)
         for _ in range(min(_PARTNERS, len(choices))):
@@ -115,15 +109,40 @@ def select_pairs(
     return {pair: matches for pair, matches in shared.items() if pair in chosen}
 
 
+def prescreen_pairs(estimator: PairEstimator, pairs: Sequence[Pair]) -> dict[Pair, StoredMatches]:
+    """The pairs whose strongest features match and that matter for the place of an image, with those matches.
+
+    A pair that is passed over may overlap nevertheless, by little: its place then follows from the others.
+    """
+    # These matches are few, of most pairs hardly any: a file for each would take as long as the matching.
+    strongest = replace(estimator, features=estimator.features.strongest(_STRONGEST), store=estimator.cache)
+    shared = dict(zip(pairs, strongest.match(pairs, "comparing images"), strict=True))
+    most = np.zeros(len(estimator.features), dtype=np.intp)
+    for pair, matches in shared.items():
+        most[[*pair]] = np.maximum(most[[*pair]], len(matches))
+    promising = {
+        pair: matches
+        for pair, matches in shared.items()
+        if len(matches) >= max(_MIN_MATCHES, _MIN_RELATIVE_MATCHES * most[[*pair]].min())
+    }
+    return select_pairs(promising, estimator.cameras)
+
+
+def estimate_candidates(estimator: PairEstimator, candidates: Sequence[Pair]) -> list[PairRegistration]:
+    """Estimate the candidate pairs that share something at first sight; all of them where none of those holds."""
+    prescreened = prescreen_pairs(estimator, candidates)
+    pairs = estimator.estimate(prescreened, shared=prescreened)
+    return pairs if any(pair.relation for pair in pairs) else estimator.estimate(candidates)
+
+
 def loop_closures(
-    cameras: Sequence[Camera], homographies: FloatArray, tried: set[tuple[int, int]], *, on_sphere: bool = False
-) -> Pairs:
+    cameras: Sequence[Camera], homographies: FloatArray, tried: set[Pair], *, on_sphere: bool = False
+) -> list[Pair]:
     """Pairs that the poses put over one another and that were not tried yet, where the match graph needs them.
 
     It does not need a pair of images that both have their partners, one of them in common: that closes no loop.
-
-    ``homographies`` (N, 3, 3): from undistorted normalized coordinates of each image to the plane, or to directions;
-    NaN for images without a pose; ``tried``: pairs (i, j), i < j; ``on_sphere``: whether they lead to directions.
+    ``homographies`` (N, 3, 3) lead from undistorted normalized coordinates to the plane, or to directions
+    (``on_sphere``); NaN for images without a pose.
     """
     middles = homographies[:, :, 2]
     with np.errstate(invalid="ignore"):
@@ -133,14 +152,13 @@ def loop_closures(
         return []
     size = np.linalg.norm(middles[known], axis=1) if on_sphere else middles[known, 2]
     centres = middles[known] / size[:, None]
-    partners: dict[int, set[int]] = {}
+    partners = defaultdict[int, set[int]](set)
     for i, j in tried:
-        partners.setdefault(i, set()).add(j)
-        partners.setdefault(j, set()).add(i)
+        partners[i].add(j)
+        partners[j].add(i)
 
     def needed(i: int, j: int) -> bool:
-        first, second = partners.get(i, set()), partners.get(j, set())
-        return min(len(first), len(second)) < _PARTNERS or not first & second
+        return min(len(partners[i]), len(partners[j])) < _PARTNERS or not partners[i] & partners[j]
 
     pairs = [pair for pair in sorted(_nearest_pairs(centres, known, _NEIGHBOURS) - tried) if needed(*pair)]
     both = np.array([*pairs, *(pair[::-1] for pair in pairs)], dtype=np.intp).reshape(-1, 2)

@@ -63,9 +63,8 @@ def spanning_tree(
 ) -> SpanningTree:
     """The spanning tree of largest total weight over ``count`` connected images.
 
-    ``image1, image2`` (L,); ``weight`` (L,): how much each link can be relied on; ``root``: the centre of the tree,
-    from where the farthest image is the fewest steps away, if not given; of two, the one whose links weigh more, so
-    that the numbers of the images do not decide.
+    The root, if not given, is its centre, from where the farthest image is the fewest steps away; of two, the one
+    whose links weigh more, so that the numbers of the images do not decide.
     """
     tree = spanning_forest(count, image1, image2, weight)
     number = _graph(count, image1[tree], image2[tree], tree.astype(np.float64) + 1.0)

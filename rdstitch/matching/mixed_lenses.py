@@ -39,8 +39,6 @@ def two_lenses(cameras: Sequence[Camera], votes: LensVotes) -> TwoLenses | None:
     Relief and lenses that one λ does not describe scatter the votes by many times their standard deviations, and a few
     scattered votes can always be divided somehow. Two lenses must therefore explain what pairs of both see far better
     than one lens does, the more so the fewer pairs there are; and they must differ by enough to be seen in the result.
-
-    ``cameras``: one an image; only their sizes are used.
     """
     if not len(votes):
         return None
@@ -73,34 +71,25 @@ def two_lenses(cameras: Sequence[Camera], votes: LensVotes) -> TwoLenses | None:
 def separate_lenses(
     cameras: Sequence[Camera], pairs: Sequence[PairRegistration], threshold: float, known_distortion: float | None
 ) -> tuple[TwoLenses | None, Mapping[int, str]]:
-    """Both lenses, where there are two, and the images of that which took fewer, with why they are left out.
+    """Both lenses, and the images of that which took fewer, or has fewer matches, with why they are left out.
 
-    None where one lens will do or λ is known; none are left out where it is not clear which belong together.
-
-    ``cameras``: one an image; ``threshold``: largest transfer error of an inlier, pixels; ``known_distortion``: λ in
-    the half-diagonal frame, where the user gave it.
+    None where one lens will do or λ is known (``known_distortion``); none are left out where it is not clear which
+    belong together. ``threshold``: largest transfer error of an inlier, pixels.
     """
     mixed = None if known_distortion is not None else two_lenses(cameras, LensVotes.of(pairs, threshold))
-    return mixed, {} if mixed is None else _of_the_other_lens(mixed, pairs)
-
-
-def _of_the_other_lens(mixed: TwoLenses, pairs: Sequence[PairRegistration]) -> dict[int, str]:
-    """Images of the lens that took fewer, or has fewer matches, with why they are left out; none if in doubt."""
-    if not mixed.certain:
-        return {}
-    linked = [pair for pair in pairs if pair.relation]
+    if mixed is None or not mixed.certain:
+        return mixed, {}
     sizes = []
     for second in (False, True):
-        of_lens = [pair for pair in linked if mixed.second[[pair.image1, pair.image2]].tolist() == [second] * 2]
+        of_lens = [p for p in pairs if p.relation and mixed.second[[*p.images]].tolist() == [second] * 2]
         members = {image for pair in of_lens for image in pair.images}
         sizes.append((len(members), sum(int(pair.relation.inliers.sum()) for pair in of_lens)))
     kept = sizes[1] > sizes[0]
-    left_out, used = mixed.distortion[not kept], mixed.distortion[kept]
     reason = (
-        f"comes from another lens or zoom setting (λ about {left_out:.3f}, that of the others {used:.3f}); "
-        "stitch those of each on their own"
+        f"comes from another lens or zoom setting (λ about {mixed.distortion[not kept]:.3f}, that of the others "
+        f"{mixed.distortion[kept]:.3f}); stitch those of each on their own"
     )
-    return {int(k): reason for k in np.flatnonzero(mixed.second != kept)}
+    return mixed, {int(k): reason for k in np.flatnonzero(mixed.second != kept)}
 
 
 def _divisions(count: int, votes: LensVotes) -> Iterator[tuple[BoolArray, FloatArray]]:

@@ -89,12 +89,6 @@ def similarity(features: FeatureStore, seed: int) -> Similarity | None:
 
     ``features``: one an image, in the order in which the images were taken, if there is one; read twice, one at a time.
     """
-    weights = _weighted_words(features, seed)
-    return None if weights is None else _compare(weights)
-
-
-def _weighted_words(features: FeatureStore, seed: int) -> "sparse.csr_array | None":
-    """The words of each image, as unit vectors (N, words); zero for images without features."""
     counts = np.minimum(features.counts, _FEATURES_PER_IMAGE)
     total = int(counts.sum())
     if total < _MIN_DESCRIPTORS:
@@ -113,7 +107,7 @@ def _weighted_words(features: FeatureStore, seed: int) -> "sparse.csr_array | No
     used = sparse.coo_array((ones, (image, word)), shape=(len(counts), vocabulary.size)).tocsr()
     rarity = np.log(len(counts) / np.maximum(np.bincount(used.indices, minlength=vocabulary.size), 1))
     weighted = (used @ sparse.diags_array(rarity.astype(np.float32))).tocsr()
-    return _unit_rows(weighted)
+    return _compare(_unit_rows(weighted))
 
 
 def _training(features: FeatureStore, parts: list[IntArray], starts: IntArray) -> NDArray[np.float16]:
@@ -139,7 +133,7 @@ def _describing(features: Features) -> Array32:
 
 
 def _compare(weights: "sparse.csr_array") -> Similarity:
-    """Compare all images with one another, some rows of the matrix at a time."""
+    """Compare all images by their words, unit vectors (N, words), zero without features; some rows at a time."""
     count = weights.shape[0]
     kept = min(_SHORTLIST, count - 1)
     best, values = np.empty((count, kept), dtype=np.intp), np.empty((count, kept))
@@ -158,15 +152,10 @@ def _compare(weights: "sparse.csr_array") -> Similarity:
         best[rows], values[rows] = (np.take_along_axis(one, order, axis=1) for one in (nearest, of_nearest))
     excess = np.maximum(values - (usual[:, None] + usual[best]) / 2.0, 0.0)
     ordered = bool(next_one[:-1].mean() > _MIN_SEQUENTIAL_FRACTION)
-    return Similarity(_with_shared_neighbours(best, excess), best, ordered)
-
-
-def _with_shared_neighbours(best: IntArray, excess: FloatArray) -> "sparse.csr_array":
-    """Similarities (N, N), raised where images are alike to the same others."""
-    direct = _symmetric(best, excess)
+    # Raised where images are alike to the same others: all neighbours in common count as the usual best similarity.
     neighbours = _unit_rows(_symmetric(best[:, :_SHARED_NEIGHBOURS], excess[:, :_SHARED_NEIGHBOURS]))
-    # To have all neighbours in common counts as much as the usual best similarity.
-    return sparse.csr_array(direct + float(np.mean(excess[:, 0])) * (neighbours @ neighbours.T))
+    scores = _symmetric(best, excess) + float(np.mean(excess[:, 0])) * (neighbours @ neighbours.T)
+    return Similarity(sparse.csr_array(scores), best, ordered)
 
 
 def _symmetric(columns: IntArray, values: FloatArray) -> "sparse.csr_array":

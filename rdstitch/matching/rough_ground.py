@@ -33,9 +33,8 @@ most pairs show one plane, and what is off it are outliers: buildings reach 0.4,
 def over_rough_ground(pairs: Sequence[PairRegistration], threshold: float) -> Sequence[PairRegistration]:
     """The pairs with all matches that the ground explains as inliers, where it is not the plane that each shows.
 
-    ``threshold``: largest transfer error of an inlier, pixels: by so much matches of one place differ; gives the same
-    where the ground is no rougher than what is found of it anyway. Otherwise homographies fit all of the inliers, and λ
-    stays that of the planes.
+    The same pairs where it is no rougher; otherwise homographies fit all of the inliers, and λ stays that of the
+    planes. ``threshold``: largest transfer error of an inlier, pixels: by so much matches of one place differ.
     """
     related = [pair for pair in pairs if pair.relation]
     inliers = sum(int(pair.relation.inliers.sum()) for pair in related)

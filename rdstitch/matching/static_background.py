@@ -60,8 +60,7 @@ def without_static_background(
 ) -> tuple[PairEstimator, list[PairRegistration]] | None:
     """Where a part of the images is static, the estimator and pairs of what moves; None where none is.
 
-    What the images have in common was static then, so that it says nothing of which of the candidate pairs matter: all
-    of them are compared.
+    All candidate pairs are compared: what the images have in common was static, and did not show which of them matter.
     """
     threshold = estimator.estimation.threshold
     if not has_static_background(pairs, threshold):
@@ -111,19 +110,17 @@ def moving_features(features: FeatureStore, pairs: Sequence[PairRegistration], t
         if size2 != size1:
             places[size2].append(matched.points2)
     radius = threshold * _MAX_STATIC_MOTION
-    static = {size: _confirmed(np.concatenate(of_size), radius) for size, of_size in places.items()}
+    static = dict[Size | None, "spatial.cKDTree"]()  # places that lie within the radius of several
+    for size, of_size in places.items():
+        tree = spatial.cKDTree(together := np.concatenate(of_size))
+        confirmations = tree.query_ball_point(together, radius, return_length=True)
+        static[size] = spatial.cKDTree(together[confirmations >= _MIN_CONFIRMATIONS])
     for loaded, kept in zip(features, moving, strict=True):
         if loaded.image_size in static:
             kept &= ~np.isfinite(static[loaded.image_size].query(loaded.points, distance_upper_bound=radius)[0])
     return FeatureStore(
         tuple(stored.take(np.flatnonzero(kept)) for stored, kept in zip(features.items, moving, strict=True))
     )
-
-
-def _confirmed(places: FloatArray, radius: float) -> "spatial.cKDTree":
-    """Places (N, 2) that lie within the radius, pixels, of several."""
-    confirmations = spatial.cKDTree(places).query_ball_point(places, radius, return_length=True)
-    return spatial.cKDTree(places[confirmations >= _MIN_CONFIRMATIONS])
 
 
 def show_motion(pairs: Sequence[PairRegistration], count: int, threshold: float) -> bool:

@@ -89,7 +89,7 @@ def _repairs(
     plane = None if aligner.options.purpose.lens_only else plane_of_most(first.registration, aligner, threads)
     if plane is not None and not (checked := check(plane)).fails_as_whole:
         yield (start := checked)
-    current, rejected = start, dict[tuple[int, ...], Message]()
+    current, rejected = start, dict[tuple[int, ...], str]()
     for _ in range(_MAX_ROUNDS):
         if current.fails_as_whole:
             return
@@ -111,7 +111,7 @@ def _without_damage(registration: Registration, aligner: Aligner, guard: InputGu
     damaged = [k for k, source in enumerate(registration.sources) if source.path in guard.damaged and used[k]]
     if not damaged:
         return None
-    reason = Message("is damaged, and all others fit better without it; copy it again from its source")
+    reason = "is damaged, and all others fit better without it; copy it again from its source"
     rest = without(registration, {(k,): reason for k in damaged}, aligner)
     return rest if rest is not None and 2 * rest.alignment.used.sum() > used.sum() else None
 
@@ -129,14 +129,14 @@ def _worst(checked: _Checked) -> Rejected:
     if not single:
         pairs = [finding for finding in failures if finding.kind.scope is Scope.PAIR]
         said = zip(pairs, messages_of(pairs, registration), strict=True)
-        return {finding.images: message for finding, message in said}
+        return {finding.images: message.text for finding, message in said}
     used = [fit for fit in registration.alignment.links if fit.used]
     fit_share, links_of = agreement(used, len(registration.sources)), links_by_image(used)
-    chosen = dict[tuple[int, ...], Message]()
+    chosen = dict[tuple[int, ...], str]()
     beside: set[int] = set()
     for image in sorted(single, key=lambda k: (fit_share[k], k)):
         if image not in beside:
-            (chosen[image,],) = messages_of([single[image]], registration)
+            chosen[image,] = messages_of([single[image]], registration)[0].text
             beside |= {k for fit in links_of.get(image, []) for k in fit.images}
     return chosen
 
@@ -152,7 +152,7 @@ def agreement(links: Sequence[LinkFit], count: int) -> np.ndarray:
 
 def scale_uncertainty(alignment: Alignment) -> list[Message]:
     """A warning where the focal length, and with it the length of every step, is hardly known."""
-    if not alignment.length_std > Limits.max_length_std.value:
+    if not alignment.length_std > Limits.max_length_std:
         return []
     off = f"all lengths may be off together by {alignment.length_std:.0%}"
     text = f"{off}: the images hardly show the focal length; give --focal"

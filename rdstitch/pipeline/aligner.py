@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, GivenImages, most_matches_read
+from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
 from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.choices import Purpose
@@ -99,7 +99,7 @@ class Aligner:
         tilts = self.options.exact_tilts(len(self.cameras))
         if not tilts:
             return tilts
-        return [(psi, theta) for psi, theta in self._quarters.upright_tilts(np.array(tilts)).tolist()]
+        return [(psi, theta) for psi, theta in self._quarters.tilts(np.array(tilts)).tolist()]
 
     def align(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
         """Align the images by the pairs that were registered; from an earlier run where the cache has it."""
@@ -112,7 +112,7 @@ class Aligner:
         ground = over_rough_ground(pairs, self.threshold)
         if ground is not pairs and not self._explains(aligned.alignment, pairs, ground):
             over = self._drafted(ground)
-            if over.alignment.rms <= Limits.max_rough_rms.value * self.threshold:  # else it is not one ground
+            if over.alignment.rms <= Limits.max_rough_rms * self.threshold:  # else it is not one ground
                 aligned = replace(over, pairs=tuple(pairs), rough=True)
         return self.metric(aligned) if self.needs_poses else aligned
 
@@ -154,15 +154,15 @@ class Aligner:
         if not evidence:
             near, evidence = {}, [*related]
         ends = [*evidence, *(ends for ends in related if near.keys() & {*ends})]
-        most, quarters = most_matches_read(len(evidence), self.options), self._quarters
-        cameras = tuple(quarters.stored_camera(camera, k) for k, camera in enumerate(self.cameras))
+        most, stored = most_matches_read(len(evidence), self.options), self._quarters.back
+        cameras = tuple(stored.camera(camera, k) for k, camera in enumerate(self.cameras))
         named = (replace(related[i, j].link().thinned(most), image1=i, image2=j) for i, j in ends)
-        links = tuple(quarters.stored_link(link, self.cameras) for link in named)
+        links = tuple(stored.link(link, self.cameras) for link in named)
         if (size := common_size(cameras, links)) is not None:
             cameras = tuple(framed_camera(camera, size) for camera in cameras)
             links = tuple(framed_link(link, size) for link in links)
         options = replace(self.options, reference=None if reference is None else copies.get(reference, reference))
-        task = AlignmentTask(GivenImages(cameras, links[: len(evidence)], options, near, links[len(evidence) :]))
+        task = AlignmentTask(cameras, links[: len(evidence)], options, near, links[len(evidence) :])
         compared, twice = [related[pair].images for pair in evidence], copies | near
 
         def complete(stage: str, compute: Callable[[], Alignment]) -> Alignment:
@@ -183,14 +183,13 @@ class Aligner:
 
     def _recalled(self, stage: str, task: AlignmentTask, compute: Callable[[], Alignment]) -> Alignment:
         """An alignment of the upright images; from an earlier run where the cache has it."""
-        given = task.given
-        of_links = (given.links, given.links_of_copies, sorted(given.near_copies.items()))
-        inputs = (given.cameras, self.cache.digest(of_links), given.options)
+        of_links = (task.links, task.links_of_copies, sorted(task.near_copies.items()))
+        inputs = (task.cameras, self.cache.digest(of_links), task.options)
         alignment = self.cache.recall(stage, inputs, compute)
-        sizes = [self._quarters.stored_camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
+        sizes = [self._quarters.back.camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
         if any(camera.image_size != size for camera, size in zip(alignment.cameras, sizes, strict=True)):
             alignment = cut_alignment(alignment, sizes)
-        return self._quarters.upright_alignment(alignment, given.options.gravity)
+        return self._quarters.alignment(alignment, task.options.gravity)
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
         """A draft of the same pairs by a model with metric poses, where the user left the choice of the model open."""

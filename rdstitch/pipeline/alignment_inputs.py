@@ -19,11 +19,11 @@ from rdstitch.system.file_access import canonical_name
 
 def alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:
     """What is known of images as the camera stored them; attitudes that are not exact leave the mount's tilt open."""
-    quarters = QuarterTurns.of(sources)
+    stored = QuarterTurns.of(sources).back
     measured = [source.attitude for source in sources if source.attitude is not None]
     attitudes = [attitude.tilt for attitude in measured]
     delayed = [attitude.by_delay for attitude in measured if attitude.by_delay is not None]
-    timed = delayed and len(delayed) == len(sources) and set(quarters.back) == {1}
+    timed = delayed and len(delayed) == len(sources) and stored.none
     exact = bool(attitudes) and options.attitude_std == 0.0
     places = [source.metadata.gps for source in sources]
     return AlignmentOptions(
@@ -32,10 +32,10 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
         lens=options.lens,
         lens_known=options.known_distortion is not None,
         tilt=options.tilt or ((0.0, 0.0) if exact else None),
-        attitudes=quarters.stored_tilts(np.array(attitudes)) if attitudes else None,
+        attitudes=stored.tilts(np.array(attitudes)) if attitudes else None,
         delayed_attitudes=np.array(delayed) if timed else None,
         attitudes_std=options.attitude_std,
-        gravity=_gravity(sources, quarters),
+        gravity=_gravity(sources, stored),
         positions=positions_of(sources) if sources else None,
         positions_std=[math.nan if p is None or p.std is None else p.std[0] for p in places] or None,
         pose_covariance=options.pose_covariance,
@@ -46,20 +46,20 @@ def sightings(sources: Sequence[Source], cameras: Sequence[Camera]) -> tuple[Sig
     """Ground control points in the images as the camera stored them, of the size that features are detected at."""
     shown = [(k, point) for k, source in enumerate(sources) for point in source.control if not point.check]
     metres = metres_around_median([point.place for _, point in shown])
-    sightings, quarters = [], QuarterTurns.of(sources)
+    sightings, stored = [], QuarterTurns.of(sources).back
     for (k, point), (east, north) in zip(shown, metres.tolist(), strict=True):
-        x, y = quarters.stored_point(sources[k].camera.normalize(point.pixel) * cameras[k].scale, k).tolist()
+        x, y = stored.point(sources[k].camera.normalize(point.pixel) * cameras[k].scale, k).tolist()
         sightings.append(Sighting(k, (x, y), point.name, (east, north), point.std))
     return tuple(sightings)
 
 
-def _gravity(sources: Sequence[Source], quarters: QuarterTurns) -> FloatArray | None:
+def _gravity(sources: Sequence[Source], stored: QuarterTurns) -> FloatArray | None:
     """Direction down in the axes of each camera, (N, 3), by its attitude or its XMP; None where all lack both."""
     known = [source.down for source in sources]
     if all(down is None for down in known):
         return None
     directions = np.array([(np.nan,) * 3 if down is None else down for down in known])
-    return quarters.stored_directions(directions)
+    return stored.directions(directions)
 
 
 def _reference(sources: Sequence[Source], name: str | None) -> int | None:

@@ -120,7 +120,7 @@ def apply_found(
     given = read_replacements(saved, listed.frames, options, run.guard, run.options.composite.max_memory)
     if output is not None:
         check_world_files([output], list(given.sources.values()), options.overwrite)
-    lens, of_lens = _lens_of_band(saved, given.frames, given.sources, run.progress)
+    lens, of_lens = _lens_of_band(saved, given.sources, run.progress)
     plan, run, of_turn = _laid_out(saved, given.sources, lens, run)
     composed, of_output = compose_images(plan, run, outputs)
     sources = dict(zip(given.sources, plan.placed.sources, strict=True))
@@ -176,11 +176,12 @@ def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: Co
 
 
 def _lens_of_band(
-    saved: SavedRegistration, frames: Mapping[int, Frame], used: Mapping[int, Source], progress: Progress
+    saved: SavedRegistration, used: Mapping[int, Source], progress: Progress
 ) -> tuple[BandLens | None, list[Message]]:
     """The lens that took the given images, where that is another one than took those that were registered."""
     if saved.record.stage is not None:
         return None, []  # channels of a microscope have their places in common, not their content
+    frames = {index: source.frame or Frame(source.path) for index, source in used.items()}
     files = files_of(frame for frame in frames.values() if frame.number is None)
     originals = {k: file for k in frames if (file := saved.original(saved.images[k])) is not None}
     if files and not originals:
@@ -195,7 +196,11 @@ def _lens_of_band(
             read, _ = read_sources([Frame(file)], skip_bad=True)
             if read and read[0].metadata.size == size:
                 pairs[index] = replace(read[0], camera=camera), used[index]
-    return band_lens(pairs, lambda done, total: progress("comparing bands", done, total))
+    lens = band_lens(pairs, lambda done, total: progress("comparing bands", done, total))
+    if lens is None:
+        return None, []
+    text = f"{lens.shift:.1f} pixels (median) from the registered band, {lens.error:.1f} with its lens registered too"
+    return lens, [Message(text, severity="note", code="band-lens")]
 
 
 def _placed(saved: SavedRegistration, used: Mapping[int, Source], lens: BandLens | None) -> PlacedImages:

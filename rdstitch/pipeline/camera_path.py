@@ -38,7 +38,7 @@ def camera_path(
     """
     sources, messages = registration.sources, list[Message]()
     # Of the camera itself, whatever EXIF says of how its images are looked at.
-    stored = QuarterTurns.of(sources).stored_alignment(registration.alignment)
+    stored = QuarterTurns.of(sources).back.alignment(registration.alignment)
     path = Trajectory.from_alignment(stored, height or 1.0)
     if odometry is not None:
         path, messages = _along_odometry(path, sources, odometry, keep_unit=height is not None)

@@ -26,9 +26,15 @@ from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
 from rdstitch.matching.copies import copies_of, distinct
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.align_locally import align_registration_locally, straight_edges
 from rdstitch.pipeline.aligner import Aligner
-from rdstitch.pipeline.lay_out import IMAGE_GRID, CandidateLayout, is_stretched, lay_out
+from rdstitch.pipeline.lay_out import (
+    IMAGE_GRID,
+    CandidateLayout,
+    align_registration_locally,
+    is_stretched,
+    lay_out,
+    straight_edges,
+)
 from rdstitch.pipeline.realign import by_second_motions, plane_of_most, realigned
 from rdstitch.pipeline.register import with_frontal_reference
 from rdstitch.pipeline.whole_pixels import on_whole_pixels
@@ -212,7 +218,7 @@ def _error(registration: Registration) -> float:
     pairs = [pair for pair in distinct_pairs if used[pair.image1] and used[pair.image2]]
     some = [pairs[k] for k in evenly_spaced(len(pairs), _SAMPLED_PAIRS).tolist()]
     errors = np.concatenate([np.zeros(0), *(pair.errors(transfer)[pair.relation.inliers] for pair in some)])
-    return float(np.median(np.nan_to_num(errors, nan=np.inf))) if len(errors) else math.inf
+    return float(np.median(errors)) if len(errors) else math.inf
 
 
 def _differs(registration: Registration, allowed: float, other: Alignment, *, stretched: bool) -> bool:
@@ -228,4 +234,4 @@ def _differs(registration: Registration, allowed: float, other: Alignment, *, st
         before, after = (one.transfer(i, j, points) for one in (alignment, other))
         inside = ((before >= 0.0) & (before < alignment.cameras[j].image_size)).all(axis=1)
         moved.append(np.linalg.norm(after - before, axis=1)[inside] / (2.0 * alignment.cameras[j].scale))
-    return not np.quantile(np.nan_to_num(np.concatenate(moved), nan=np.inf), _SHIFT_QUANTILE) <= _MIN_SHIFT
+    return not np.quantile(np.concatenate(moved), _SHIFT_QUANTILE, method="higher") <= _MIN_SHIFT

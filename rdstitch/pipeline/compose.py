@@ -63,7 +63,7 @@ class CanvasPlan:
         canvas, place, reason = plan_on_map(placed, options)
         if options.rectangle is not None:
             canvas = replace(canvas, cropped_to=_box_of_rectangle(placed, options.rectangle, canvas))
-        return cls(placed, canvas, placed.images(canvas.near), place, reason)
+        return cls(placed, canvas, placed.images(canvas), place, reason)
 
     def decided(self, options: CompositeOptions) -> Self:
         """The plan with exposure, seams and crop of its images, decided on small versions of them."""

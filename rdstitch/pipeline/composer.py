@@ -52,7 +52,7 @@ class Composer:
     @one_native_thread()
     def __init__(self, result: OutputImage, interpolation: Interpolation = "linear") -> None:
         placed, options = result.placed, replace(result.options.composite, interpolation=interpolation)
-        images = placed.images(result.canvas.near)
+        images = placed.images(result.canvas)
         self.names = tuple(source.name for source in placed.sources)
         self._tables, self._order = CompositeTables.of(images, result.canvas, options), result.options.channel_order
         self.alpha = self._tables.alpha

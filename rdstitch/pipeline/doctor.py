@@ -24,13 +24,13 @@ from rdstitch.results.messages import Message, bytes_in_words, merge_by_reason, 
 from rdstitch.results.registration import Registration
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.progress import Progress, silent
+from rdstitch.verification.limits import Limits
 from rdstitch.verification.verdict import RefusedError
 
 _MEGAPIXELS, _FEATURES = 0.2, 500  # of the small versions
 _BLURRED = 0.6  # of the median sharpness
 _DARK, _BURNT = 0.06, 0.05  # mean brightness; share of burnt-out pixels
 _MIN_OVERLAP = 0.3
-_ZOOMED = 1.03  # ratio of focal lengths by EXIF
 _UNKNOWN_CAMERA = "unknown"
 _GRID = 24  # points a side by which an overlap is measured
 
@@ -276,6 +276,6 @@ def _focal(sources: Sequence[Source]) -> tuple[str, bool]:
     if not pixels:
         return "not known from EXIF; it is guessed, which matters for trajectory only", False
     shares = [focal / side for focal, side in pixels]
-    zoomed = max(shares) > _ZOOMED * min(shares)
+    zoomed = max(shares) > Limits.max_focal_ratio * min(shares)
     text = f"{min(pixels)[0]:.0f}" + (f" to {max(pixels)[0]:.0f}" if zoomed else "")
     return f"{text} pixels by EXIF in {len(pixels)} of {len(sources)} images", zoomed

@@ -31,7 +31,7 @@ from rdstitch.pipeline.read_inputs import read_frames
 from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message
 from rdstitch.results.pose import FollowedPoses, Pose
-from rdstitch.tracking import FrameTracker, TrackingOptions, TrackingResult
+from rdstitch.tracking import FrameTracker, TrackingResult
 from rdstitch.tracking.preview import LivePreview
 
 _FEATURES = 600  # of a frame, that suffice to follow it
@@ -121,14 +121,14 @@ class Tracker:
         ):  # before the first frame, not at each
             if file is not None and file != XMP and not Path(file).is_dir():
                 check_readable(Path(file))
-        how = TrackingOptions(self._options.estimation, alignment_options([], self._options), patient)
         # Of frames that have been made ready.
         features = replace(self._detection, work_megapixels=None, stretch=None, equalize=False)
         apart = (self._options.threads > 1 or not patient) and bool(sys.executable)
         executor = ProcessExecutor(1) if apart else ThreadPoolExecutor(1)
         weakref.finalize(self, executor.shutdown, wait=False, cancel_futures=True)
         matcher = partial(match, ratio=self._options.ratio)
-        self._frames = FrameTracker(how, partial(_features, features), matcher, executor)
+        known = self._options.estimation, alignment_options([], self._options)
+        self._frames = FrameTracker(*known, partial(_features, features), matcher, executor, patient=patient)
         self._labels: dict[int, Pose] = {}  # of the frames that may still find their place
         self._numbers = count()
         self.revised: tuple[Pose, ...] = ()

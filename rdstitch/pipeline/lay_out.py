@@ -1,24 +1,29 @@
-"""Stage: images of a registration on the canvas of the output, and what speaks against what is seen there."""
+"""Stages: images of a registration, aligned locally, on the canvas of the output; and what speaks against it."""
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rdstitch.arrays import FloatArray
+from rdstitch.choices import LocalAlignmentMode
 from rdstitch.compositing.projection import PLANE
 from rdstitch.compositing.seam_quality import SeamQuality
-from rdstitch.local_alignment import LocalAlignment
+from rdstitch.features.line_segments import MEGAPIXELS, line_segments
+from rdstitch.inputs.source import Source
+from rdstitch.local_alignment import LocalAlignment, Match, align_locally, no_local_alignment
+from rdstitch.matching.two_view import PairRegistration
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.pipeline.compose import CanvasPlan
 from rdstitch.pipeline.straighten import oriented
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.registration import Registration
+from rdstitch.verification.limits import Limits
 
-_MAX_MAGNIFICATION, _MAX_ASPECT = 4.0, 2.0
-"""Of a place over the median one, and of its two directions: those of a plane seen 60 degrees off its normal."""
-
+# Places (25, 2) all over an image, in shares of its width and height.
 IMAGE_GRID = np.stack(np.meshgrid(*[[0.02, 0.25, 0.5, 0.75, 0.98]] * 2), axis=-1).reshape(-1, 2)
-"""Places (25, 2) all over an image, in shares of its width and height."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +60,48 @@ class CandidateLayout:
         return int(self.seams.broken.sum())
 
 
+def straight_edges(source: Source) -> FloatArray:
+    """Ends (N, 2, 2) of the straight edges in an image, pixels."""
+    return line_segments(source.view(MEGAPIXELS))[0]
+
+
+def align_registration_locally(
+    registration: Registration,
+    choice: LocalAlignmentMode,
+    edges: Callable[[int], FloatArray] | None = None,
+    threads: int = 1,
+) -> LocalAlignment:
+    """Displacement fields of the images that are used, in their order, from the matches of all their pairs.
+
+    ``edges`` are those of an image that fields should not bend.
+    """
+    if choice == "off":
+        return no_local_alignment("switched off")
+    alignment = registration.alignment
+    used, poses = np.flatnonzero(alignment.used), alignment.poses
+    position = np.cumsum(alignment.used) - 1
+    pairs = [pair for pair in registration.used_pairs if pair.relation]
+
+    def match(pair: PairRegistration) -> Match:
+        found = pair.correspondences
+        return Match(int(position[pair.image1]), int(position[pair.image2]), found.points1, found.points2)
+
+    def edges_of(images: list[int]) -> list[FloatArray]:
+        with ThreadPoolExecutor(threads) as pool:
+            return list(pool.map(edges or (lambda k: straight_edges(registration.sources[k])), used[images].tolist()))
+
+    return align_locally(
+        map(match, pairs),
+        [alignment.cameras[k] for k in used],
+        alignment.homographies[used],
+        choice,
+        pairs=len(pairs),
+        on_sphere=alignment.on_sphere,
+        centers=None if poses is None or alignment.on_sphere else np.column_stack([poses.position, poses.height])[used],
+        edges=edges_of,
+    )
+
+
 def lay_out(registration: Registration, local: LocalAlignment, options: CompositeOptions) -> CandidateLayout:
     """Images of a registration on the canvas of the output."""
     placed, messages = oriented(PlacedImages.of(registration, local.fields or None), options)
@@ -81,4 +128,5 @@ def is_stretched(plan: CanvasPlan) -> bool:
         magnification.append(np.linalg.svd(jacobian, compute_uv=False))
     every = np.concatenate(magnification)
     largest = float(every[:, 0].max() / np.median(every[:, 0]))
-    return largest > _MAX_MAGNIFICATION or float(np.median(every[:, 0] / every[:, 1])) > _MAX_ASPECT
+    aspect = float(np.median(every[:, 0] / every[:, 1]))
+    return largest > Limits.max_magnification or aspect > Limits.max_aspect

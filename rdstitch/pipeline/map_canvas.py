@@ -1,12 +1,13 @@
-"""The canvas of georeferenced images: north up, and of the ground sample distance that was requested."""
+"""The canvas of images; of georeferenced ones north up, and of the ground sample distance that was requested."""
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.compositing import Canvas, CompositeOptions
+from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
 from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference, check_summary, map_summary
 from rdstitch.export.map_grid import MapGrid, grid_of_extent, read_grid
@@ -14,7 +15,7 @@ from rdstitch.export.place_on_map import MIN_POSITIONS, has_place, place_on_map
 from rdstitch.geometry.crs import Crs
 from rdstitch.inputs.source import Source
 from rdstitch.results.messages import MAX_NAMED, Message
-from rdstitch.results.placed_images import PlacedImages, plan
+from rdstitch.results.placed_images import PlacedImages
 
 
 def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:
@@ -23,18 +24,45 @@ def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:
         Crs(options.epsg)
     if options.like is not None:
         read_grid(options.like)
-    placed = has_place([source.metadata.gps for source in sources]) or any(source.control for source in sources)
-    for name, value in (
-        ("gsd", options.gsd),
-        ("crs", options.epsg),
-        ("like", options.like),
-        ("extent", options.extent),
-    ):
-        if value is not None and not placed:
+    wanted = {"gsd": options.gsd, "crs": options.epsg, "like": options.like, "extent": options.extent}
+    for name, value in wanted.items():
+        if value is not None and not has_place(sources):
             raise ArgumentError(
                 f"{name} needs GPS positions of {MIN_POSITIONS} images, in EXIF or a file, or ground control points; "
                 "leave it out"
             )
+
+
+def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
+    """The canvas of the images, no larger than ``options.max_size``."""
+    canvas = _plan(placed, options, options.scale)
+    if placed.grid is not None:
+        return canvas.on_grid(placed.grid.from_plane, placed.grid.size)
+    if options.max_size is None or max(canvas.size) <= options.max_size:
+        return canvas
+    # The canvas has whole pixels around the images, and a full turn a multiple of some: these may be too many.
+    spare = 1 if canvas.period is None else max(32, options.max_size // 128)
+    return _plan(placed, options, options.scale * (options.max_size - spare) / max(canvas.size))
+
+
+def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canvas:
+    """The canvas on a plane, or, of images taken by turning on the spot, in a projection."""
+    if not placed.turned and options.projection not in ("auto", "plane"):
+        raise ArgumentError(
+            f"the {options.projection} projection is for images taken by turning on the spot; these were not, "
+            "leave out --projection"
+        )
+    planner = partial(plan_panorama, projection=options.projection) if placed.turned else plan_canvas
+    canvas = planner(
+        placed.cameras,
+        placed.homographies,
+        scale=scale,
+        rotate=options.rotate,
+        reference=placed.reference,
+        names=[source.name for source in placed.sources],
+        max_stretch=options.max_stretch,
+    )
+    return replace(canvas, orientation=placed.orientation)
 
 
 def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas, Georeference | None, str]:

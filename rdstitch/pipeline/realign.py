@@ -4,19 +4,19 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from rdstitch.alignment.result import Alignment
-from rdstitch.alignment.unaligned import explain_unaligned
+from rdstitch.alignment.sentences import explain_unaligned
 from rdstitch.choices import Purpose
 from rdstitch.errors import RegistrationError
 from rdstitch.matching.copies import copies_of
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
-from rdstitch.results.messages import Message, names_of
+from rdstitch.results.messages import names_of
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import Cache
 from rdstitch.verification.second_motions import planes_of_pairs, second_motions
 
-Rejected = Mapping[tuple[int, ...], Message]
+Rejected = Mapping[tuple[int, ...], str]
 """What is left out, with what is wrong: images (k,), and pairs (i, j) without which other images may fall off."""
 
 
@@ -34,7 +34,7 @@ def with_reference_of(registration: Registration, aligner: Aligner) -> Registrat
 def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Alignment], bool]) -> Registration | None:
     """The images that are used aligned by another aligner; None where a draft is not wanted."""
     try:
-        draft = aligner.draft(_between_used(registration))
+        draft = aligner.draft(registration.used_pairs)
         if not wanted(draft.alignment):
             return None
         return _aligned_anew(registration, aligner.completed(draft), aligner, {})
@@ -64,19 +64,13 @@ def by_second_motions(registration: Registration, chosen: Iterable[Pair], aligne
         return frozenset(copies.get(k, k) for k in pair)
 
     wanted = {originals(pair) for pair in chosen}
-    used = _between_used(registration)
+    used = registration.used_pairs
     pairs = [pair for pair in used if pair.relation and originals(pair.images) in wanted]
     motions = second_motions(registration.alignment.cameras, pairs, aligner.threshold)
     if not motions:
         return None
     changed = [replace(pair, relation=motions.get(pair.images, pair.relation)) for pair in used]
     return _with_pairs(registration, changed, aligner)
-
-
-def _between_used(registration: Registration) -> list[PairRegistration]:
-    """The pairs of images that are used: what was left out stays out."""
-    used = registration.alignment.used
-    return [pair for pair in registration.pairs if used[pair.image1] and used[pair.image2]]
 
 
 def _with_pairs(registration: Registration, pairs: Sequence[PairRegistration], aligner: Aligner) -> Registration | None:
@@ -101,22 +95,20 @@ def without(registration: Registration, rejected: Rejected, aligner: Aligner) ->
         return None
     used = aligned.alignment.used
     neighbours = _neighbours_of(reasons, registration)
-    for images, message in rejected.items():
-        reasons |= {k: message for k in images if not used[k]}
+    for images, reason in rejected.items():
+        reasons |= {k: reason for k in images if not used[k]}
     for image, others in neighbours.items():
         named_others = ", ".join(names_of(aligner.paths[k] for k in sorted(others)))
-        reasons.setdefault(
-            image, Message(f"connected only through {named_others}, which was left out; add images around it")
-        )
+        reasons.setdefault(image, f"connected only through {named_others}, which was left out; add images around it")
     return _aligned_anew(registration, aligned, aligner, reasons)
 
 
-def left_out_images(rejected: Rejected) -> dict[int, Message]:
+def left_out_images(rejected: Rejected) -> dict[int, str]:
     """The images among the rejected."""
-    return {images[0]: message for images, message in rejected.items() if len(images) == 1}
+    return {images[0]: reason for images, reason in rejected.items() if len(images) == 1}
 
 
-def _neighbours_of(rejected: Mapping[int, Message], registration: Registration) -> dict[int, set[int]]:
+def _neighbours_of(rejected: Mapping[int, str], registration: Registration) -> dict[int, set[int]]:
     """The rejected that each other image was linked with."""
     linked: dict[int, set[int]] = {}
     for fit in registration.alignment.links:
@@ -127,13 +119,12 @@ def _neighbours_of(rejected: Mapping[int, Message], registration: Registration) 
 
 
 def _aligned_anew(
-    registration: Registration, aligned: AlignedPairs, aligner: Aligner, reasons: Mapping[int, Message]
+    registration: Registration, aligned: AlignedPairs, aligner: Aligner, reasons: Mapping[int, str]
 ) -> Registration:
     """The registration with another alignment, and why images are not in it."""
-    known = {k: message.text for k, message in reasons.items()}
     number = {path: k for k, path in enumerate(aligner.paths)}
     again = [message for message in registration.left_out if message.images[0] in number]  # the others were not read
-    known |= {number[m.images[0]]: m.text for m in again}
+    known = {**reasons, **{number[m.images[0]]: m.text for m in again}}
     unused = explain_unaligned(aligned.alignment, aligner.paths, registration.keypoints, known)
     dropped = (*registration.alignment.messages, *again)
     whole = [message for message in registration.messages if message not in dropped]

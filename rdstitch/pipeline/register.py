@@ -7,14 +7,13 @@ from functools import partial
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
-from rdstitch.alignment.unaligned import explain_unaligned
+from rdstitch.alignment.sentences import explain_unaligned
 from rdstitch.features import LightGlue, match
 from rdstitch.inputs.positions import positions_of
 from rdstitch.inputs.source import Source
-from rdstitch.matching.candidate_pairs import first_pairs
+from rdstitch.matching.candidate_pairs import estimate_candidates, first_pairs
 from rdstitch.matching.mixed_lenses import separate_lenses
 from rdstitch.matching.pair_estimator import FeatureMatching, PairEstimator
-from rdstitch.matching.prescreen import estimate_candidates
 from rdstitch.matching.repeated_pattern import match_repeated_patterns
 from rdstitch.matching.static_background import without_static_background
 from rdstitch.options.stitch_options import StitchOptions

@@ -22,8 +22,7 @@ from rdstitch.stage.tile_inputs import tile_frames
 class Replacements:
     """Images in the places of registered ones, by the numbers of these."""
 
-    frames: Mapping[int, Frame]
-    sources: Mapping[int, Source]  # of the same images, with their cameras, masks and flat field
+    sources: Mapping[int, Source]  # with their cameras, masks and flat field
     left_out: Mapping[int, Message]
     matched: MatchedBy
     messages: Sequence[Message]
@@ -54,7 +53,6 @@ def read_replacements(
         check_one_size(used)
         used, illumination = with_flat_field(used, options.flat_field)
     return Replacements(
-        {index: frame for index, frame in enumerate(chosen) if index in sources and frame is not None},
         dict(zip(sources, used, strict=True)),
         missing,
         matched,

@@ -100,7 +100,7 @@ def image_files(output: str | Path) -> list[Path]:
 
 def check_world_files(outputs: Iterable[str | Path], sources: Sequence[Source], overwrite: bool) -> None:
     """Find out before long work whether the files that place images on the Earth can be written, if there will be."""
-    if has_place([source.metadata.gps for source in sources]) or any(source.control for source in sources):
+    if has_place(sources):
         check_outputs([file for output in outputs for file in world_file_paths(output)], overwrite)
 
 

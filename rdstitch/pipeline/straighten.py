@@ -24,15 +24,16 @@ from rdstitch.features.line_segments import MEGAPIXELS, line_segments
 from rdstitch.geometry.planar_motion import nearest_rotation
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.upright_options import UprightOptions
+from rdstitch.pipeline.map_canvas import plan
 from rdstitch.results.messages import Message
-from rdstitch.results.placed_images import PlacedImages, plan
+from rdstitch.results.placed_images import PlacedImages
+from rdstitch.verification.limits import Limits
 
 _MAX_IMAGES = 40
 _MIN_LENGTH = 0.03  # of an edge, half diagonals
 _POINTING = 2.0  # pixels: how well people point at places
 _DETECTION = 0.3  # pixels: how well the detector does
 _SURE = 0.01  # relative standard deviation of an aspect ratio that needs no warning
-_MAX_CUT = 0.1  # share of what the images show that straightening may cut away
 _STEEP = math.cos(math.radians(30.0))  # a camera that looks nearer to straight up or down shows nothing upright
 
 
@@ -44,7 +45,7 @@ def oriented(placed: PlacedImages, options: CompositeOptions) -> tuple[PlacedIma
     upright, messages = _upright(placed, options) if options.upright else (None, [])
     if upright is not None and options.straighten == "auto":
         before, after = (_cut_away(placed, options, turn) for turn in (np.eye(3), upright))
-        if after > before + _MAX_CUT:
+        if after > before + Limits.max_straightening_cut:
             text = f"not straightened: {after:.0%} of what the images show would be cut away, and not {before:.0%}"
             text += "; choose another --projection, or raise --max-stretch"
             upright, messages = None, [Message(text, code="not-straightened")]

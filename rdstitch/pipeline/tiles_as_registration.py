@@ -80,7 +80,8 @@ def _pair(
         matrix, cameras[first], cameras[second], agreeing, model="rigid", rms=rms, reason="correlation"
     )
     indices = np.tile(np.arange(len(of_pair), dtype=np.intp)[:, None], 2)
-    matches = Correspondences(indices, links.points1[of_pair], links.points2[of_pair], np.zeros(len(of_pair)))
+    blocks = links.blocks.take(of_pair)
+    matches = Correspondences(indices, blocks.points1, blocks.points2, np.zeros(len(of_pair)))
     reason = Unused.NO if used else Unused.CONTRADICTS
     fit = LinkFit(first, second, len(errors), int(agreeing.sum()), rms if used else math.nan, used, reason)
     return PairRegistration(first, second, StoredMatches.of(matches), relation), fit

@@ -1,4 +1,4 @@
-"""Registered images, ready to be composited: aligned locally, without what is static, on a canvas."""
+"""Registered images, ready to be composited: aligned locally, without what is static."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, evenly_spaced
-from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
+from rdstitch.compositing import Canvas
 from rdstitch.compositing.source_images import Displacement, PlacedImage
 from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
 from rdstitch.compositing.visible_region import VisibleRegion
-from rdstitch.errors import ArgumentError
 from rdstitch.export.georeference import Georeference
 from rdstitch.export.place_on_map import Located, has_place
 from rdstitch.geometry.camera import Camera
@@ -97,7 +96,7 @@ class PlacedImages:
     @property
     def has_place(self) -> bool:
         """Whether enough is known for a place of the output on the Earth to be expected."""
-        return has_place(self.positions) or (not self.turned and any(source.control for source in self.sources))
+        return not self.turned and has_place(self.sources)
 
     def located(self, canvas: Canvas) -> Located:
         """The images on a canvas with what is known of where they are."""
@@ -113,11 +112,11 @@ class PlacedImages:
             self.leverage,
         )
 
-    def images(self, near: Sequence[VisibleRegion | None]) -> list[PlacedImage]:
-        """As the compositor takes them, with only the near parts of those that are not drawn whole."""
+    def images(self, canvas: Canvas) -> list[PlacedImage]:
+        """As the compositor takes them, with only the near parts of those that a canvas does not show whole."""
         read: list[Callable[..., DecodedImage]] = [
             source.read if part is None else partial(_read_near, source.read, part)
-            for source, part in zip(self.sources, near or [None] * len(self.sources), strict=True)
+            for source, part in zip(self.sources, canvas.near or [None] * len(self.sources), strict=True)
         ]
         if self.static is not None:
             common = Counter(camera.image_size for camera in self.cameras).most_common(1)[0][0]
@@ -162,35 +161,3 @@ def _read_moving(read: Callable[..., DecodedImage], static: NDArray[np.bool_], r
 def _read_near(read: Callable[..., DecodedImage], part: VisibleRegion, reduction: int = 1) -> DecodedImage:
     """An image, whole or reduced, of which only its near part is drawn."""
     return part.masked(read(reduction))
-
-
-def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
-    """The canvas of the images, no larger than ``options.max_size``."""
-    canvas = _plan(placed, options, options.scale)
-    if placed.grid is not None:
-        return canvas.on_grid(placed.grid.from_plane, placed.grid.size)
-    if options.max_size is None or max(canvas.size) <= options.max_size:
-        return canvas
-    # The canvas has whole pixels around the images, and a full turn a multiple of some: these may be too many.
-    spare = 1 if canvas.period is None else max(32, options.max_size // 128)
-    return _plan(placed, options, options.scale * (options.max_size - spare) / max(canvas.size))
-
-
-def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canvas:
-    """The canvas on a plane, or, of images taken by turning on the spot, in a projection."""
-    if not placed.turned and options.projection not in ("auto", "plane"):
-        raise ArgumentError(
-            f"the {options.projection} projection is for images taken by turning on the spot; these were not, "
-            "leave out --projection"
-        )
-    planner = partial(plan_panorama, projection=options.projection) if placed.turned else plan_canvas
-    canvas = planner(
-        placed.cameras,
-        placed.homographies,
-        scale=scale,
-        rotate=options.rotate,
-        reference=placed.reference,
-        names=[source.name for source in placed.sources],
-        max_stretch=options.max_stretch,
-    )
-    return replace(canvas, orientation=placed.orientation)

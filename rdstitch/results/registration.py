@@ -98,6 +98,12 @@ class Registration:
         return [source.name for source, used in zip(self.sources, self.alignment.used, strict=True) if used]
 
     @property
+    def used_pairs(self) -> list[PairRegistration]:
+        """Every pair of images that are in the result."""
+        used = self.alignment.used
+        return [pair for pair in self.pairs if used[pair.image1] and used[pair.image2]]
+
+    @property
     def summary(self) -> str:
         """How many images are in the result, and λ with its standard deviation, in one line."""
         used = int(self.alignment.used.sum())

@@ -15,7 +15,7 @@ from rdstitch.options.estimation_options import EstimationOptions
 from rdstitch.robust.chance import MIN_OCCUPIED_CELLS, occupied_cells, rejection_reason
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
-from rdstitch.robust.model_selection import PairFit, PairSelection, rms_of, select_models
+from rdstitch.robust.model_selection import ModelSelection, PairFit, StartedPairs, rms_of
 from rdstitch.robust.pair_models import PlanarPairModel
 from rdstitch.robust.ransac import Hypotheses, ransac
 
@@ -212,21 +212,14 @@ def _selected(
     solved = np.flatnonzero(np.isfinite(best.cost))
     limit = np.inf if options.select_below is None else options.select_below
     few = best.inliers[solved].sum(axis=1) < limit
-    selection = PairSelection(
-        best.homography[solved],
-        best.distortion[solved],
-        data.take(solved),
-        None if tilts is None else tilts[solved],
-        noise=None,
-        threshold=options.threshold,
-        fixed_distortion=options.distortion is not None,
-    )
+    selection = ModelSelection(options.threshold, options.distortion is not None)
+    pairs = StartedPairs(data, best.homography, best.distortion, tilts)
     std = pair.camera1.focal_log_std
     planar = [PlanarPairModel(pair.focal, std, tilts is not None, height_free=free) for free in (False, True)]
     fits: dict[int, PairFit] = {}
     for models, rows in ((planar, few), ([], ~few)):
         if rows.any():
-            selected = select_models(models, selection.take(np.flatnonzero(rows)))
+            selected = selection.select(models, pairs.take(solved[rows]))
             fits.update(zip(solved[rows].tolist(), selected, strict=True))
     return fits
 

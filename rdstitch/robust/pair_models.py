@@ -9,6 +9,7 @@ The functions of a model take the states of B pairs at once. The state of the pl
 """
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -69,9 +70,9 @@ class PlanarPairModel:
     focal_std: float = 0.0  # standard deviation of its logarithm; 0 fixes it
     tilts_known: bool = False  # whether the tilts of both images are known; otherwise they share an unknown one
     height_free: bool = False  # whether the height may change
-    _directions: FloatArray = field(init=False, repr=False, compare=False)
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def _directions(self) -> FloatArray:
         """Directions in which each free parameter moves the state, (P, 9)."""
         free: list[tuple[int, ...]] = [] if self.tilts_known else [_PSI, _THETA]
         free += [(_YAW,), (_TX,), (_TY,)]
@@ -83,7 +84,7 @@ class PlanarPairModel:
         directions = np.zeros((len(free), 9))
         for row, entries in zip(directions, free, strict=True):
             row[[*entries]] = 1.0
-        object.__setattr__(self, "_directions", directions)
+        return directions
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -38,7 +38,7 @@ tilt of a plane         0 ± 20°; 0 ± 45° (0.2)       what is laid flat is lo
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -124,19 +124,9 @@ class Prior:
         return [(density / total, part) for density, part in zip(densities, self.parts, strict=True)]
 
 
-def costs(priors: Sequence[Prior], values: FloatArray) -> float:
-    """The cost of some parameters (K,)."""
-    return sum(prior.cost(value) for prior, value in zip(priors, values.tolist(), strict=True))
-
-
-def slopes(priors: Sequence[Prior], values: FloatArray) -> FloatArray:
-    """The slopes (K,) at some parameters (K,)."""
-    return np.array([prior.slope(value) for prior, value in zip(priors, values.tolist(), strict=True)])
-
-
-def curvatures(priors: Sequence[Prior], values: FloatArray) -> FloatArray:
-    """The curvatures (K,) at some parameters (K,)."""
-    return np.array([prior.curvature(value) for prior, value in zip(priors, values.tolist(), strict=True)])
+def of_each(of: Callable[[Prior, float], float], priors: Sequence[Prior], values: FloatArray) -> FloatArray:
+    """What the priors have of some parameters (K,): costs, slopes or curvatures."""
+    return np.array([of(prior, value) for prior, value in zip(priors, values.tolist(), strict=True)])
 
 
 def exact(value: float) -> Prior:

@@ -14,7 +14,7 @@ from rdstitch.robust.chance import MIN_OCCUPIED_CELLS
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel
-from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
+from rdstitch.robust.refinement import PairProblems, refine_pairs
 from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.solvers.solutions import Solutions
@@ -222,10 +222,9 @@ class _SolverState:
     ) -> Hypotheses:
         """The start or its refinement, whichever is better."""
         problems = PairProblems(model, data, np.full(len(data), scale), None, self.solver.fixed_distortion)
-        state = model.initialize(start.homography, None if self.tilts is None else self.tilts[rows])
-        begin = Fits(state, start.homography, start.distortion)
-        fits, _ = refine_pairs(problems, begin, _LOCAL_STEPS, loose=True)
-        judged = Hypotheses.judged(fits.homography, fits.distortion, data, self.options.threshold, self.index)
+        tilts = None if self.tilts is None else self.tilts[rows]
+        found, _ = refine_pairs(problems, start.homography, start.distortion, tilts, _LOCAL_STEPS, loose=True)
+        judged = Hypotheses.judged(problems.homography(found), found[:, 0], data, self.options.threshold, self.index)
         result = start.take(np.arange(len(data)))
         better = judged.cost < start.cost
         result.put(better, judged.take(better))

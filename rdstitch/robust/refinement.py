@@ -5,7 +5,7 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.division_model import MAX_ABS_DISTORTION
 from rdstitch.robust.covariance import covariances
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, descend
@@ -15,20 +15,6 @@ from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
 
 _STATE = 9  # numbers of a state of any pair model; before these, parameters have those of the lens
-
-
-@dataclass(frozen=True, eq=False)
-class Fits(Rows):
-    """One model fitted to the matches of B pairs."""
-
-    state: FloatArray  # (B, S): the model's states
-    homography: FloatArray  # (B, 3, 3)
-    distortion: FloatArray  # (B,): λ in the half-diagonal frame
-
-    @property
-    def parameters(self) -> FloatArray:
-        """As those of :class:`PairProblems`."""
-        return np.column_stack([self.distortion, self.state])
 
 
 @dataclass(eq=False)
@@ -76,7 +62,11 @@ class PairProblems:
         """The matches transferred, with derivatives by the entries of H and the lens."""
         lens = parameters[:, :-_STATE].T
         lenses = PairLenses(lens[0]) if self.lens_std is None else PairLenses(lens[0], lens[1], lens[2], lens[3:].T)
-        return differentiate(self.model.homography(parameters[:, -_STATE:]), lenses, self.data)
+        return differentiate(self.homography(parameters), lenses, self.data)
+
+    def homography(self, parameters: FloatArray) -> FloatArray:
+        """H (B, 3, 3)."""
+        return self.model.homography(parameters[:, -_STATE:])
 
     def normal_equations(self, parameters: FloatArray) -> PairEquations:
         """Loss, normal matrix and gradient."""
@@ -137,13 +127,18 @@ class PairProblems:
 
 @np.errstate(all="ignore")  # a step may leave the domain of the lens model
 def refine_pairs(
-    problems: PairProblems, start: Fits, iterations: int, *, loose: bool = False
-) -> tuple[Fits, PairEquations]:
-    """Fit the model and λ by at most so many steps; the fits, and the equations there.
+    problems: PairProblems,
+    homography: FloatArray,
+    distortion: FloatArray,
+    tilts: FloatArray | None,
+    iterations: int,
+    *,
+    loose: bool = False,
+) -> tuple[FloatArray, PairEquations]:
+    """Parameters (B, 10) that at most so many steps lead to, and the equations there.
 
-    ``problems``: of B pairs; ``start``: their ``distortion`` is kept where it is fixed; ``loose``: another refinement
-    goes on from there.
+    From homographies (B, 3, 3), λ (B,), which is kept where it is fixed, and known tilts (B, 2, 2); ``loose``: another
+    refinement goes on from there.
     """
-    parameters, equations = descend(problems, start.parameters, iterations, loose=loose)
-    state = parameters[:, 1:]
-    return Fits(state, problems.model.homography(state), parameters[:, 0]), equations
+    state = problems.model.initialize(homography, tilts)
+    return descend(problems, np.column_stack([distortion, state]), iterations, loose=loose)

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.solvers.solutions import Solutions, as_samples
+from rdstitch.errors import ArgumentError
+from rdstitch.solvers.solutions import Solutions
 
 IndexArray = NDArray[np.intp]
 BlockSolver = Callable[[FloatArray, IndexArray], Solutions]
@@ -41,7 +42,12 @@ def solve_in_blocks(solve: BlockSolver, x1: ArrayLike, x2: ArrayLike, count: int
     Samples (B, count, 2), or one (count, 2), with a coordinate that is not finite have no solution. ``solve`` takes the
     points of a block, (2, 2, count, b), and the place of the block's samples in the batch, (b,).
     """
-    a, b = as_samples(x1, x2, count)
+    a, b = np.asarray(x1, dtype=np.float64), np.asarray(x2, dtype=np.float64)
+    if a.shape != b.shape or a.ndim not in (2, 3) or a.shape[-2:] != (count, 2):
+        raise ArgumentError(
+            f"expected two arrays of shape (B, {count}, 2) or ({count}, 2), not {a.shape} and {b.shape}"
+        )
+    a, b = a.reshape(-1, count, 2), b.reshape(-1, count, 2)
     index = np.arange(len(a))
     parts = []
     # A degenerate sample divides by zero on its way to being rejected.

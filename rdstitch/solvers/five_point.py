@@ -9,11 +9,10 @@ from rdstitch.arrays import FloatArray
 from rdstitch.geometry.division_model import SOLVED_DISTORTION
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
 from rdstitch.solvers.homography import Quadrangles
-from rdstitch.solvers.lines import determinants, squared_radii
+from rdstitch.solvers.lines import determinants, oriented_samples, squared_radii
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.roots import real_roots
 from rdstitch.solvers.solutions import Solutions
-from rdstitch.solvers.triangle_orientation import oriented_samples
 
 _DEGREE = 4
 

@@ -1,5 +1,6 @@
 """Polynomials by values at Chebyshev nodes, as Chebyshev series, and in Bernstein form on parts of the interval."""
 
+import math
 from functools import lru_cache
 from itertools import pairwise
 
@@ -102,7 +103,4 @@ def bernstein_value(coefficients: FloatArray, s: FloatArray) -> FloatArray:
 @lru_cache
 def _binomials(degree: int) -> FloatArray:
     """``C(degree, j)`` for all j."""
-    row = np.ones(1)
-    for _ in range(degree):
-        row = np.convolve(row, (1.0, 1.0))
-    return read_only(row)
+    return read_only(np.array([math.comb(degree, j) for j in range(degree + 1)], dtype=np.float64))

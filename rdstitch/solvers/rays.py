@@ -47,11 +47,10 @@ class RayPairs(SampleArrays):
         first, second = 1.0 + depth * distortion
         return first * second, x * x + y * y
 
-    def tangents_differ(self, distortion: FloatArray, focal2: FloatArray) -> FloatArray:
-        """The difference of both sides of the equation for λ and g² of shape (..., b); shape (P, ..., b)."""
+    def polynomial(self, distortion: FloatArray) -> FloatArray:
+        """The difference of both sides of the equation of the first pair for g = 1, of degree 6 in λ (..., b)."""
         product, length = self.products(distortion)
-        dot = _spread(self.dot, distortion) + focal2 * product
-        cross = _spread(self.cross, distortion) + focal2 * length
+        dot, cross = (_spread(self.dot, distortion) + product)[:, 0], (_spread(self.cross, distortion) + length)[:, 0]
         value: FloatArray = dot[0] * dot[0] * cross[1] - dot[1] * dot[1] * cross[0]
         return value
 
@@ -64,13 +63,6 @@ class RayPairs(SampleArrays):
 def _spread(values: FloatArray, distortion: FloatArray) -> FloatArray:
     """Values (..., b) that broadcast against λ of shape (..., b)."""
     return values.reshape(*values.shape[:-1], *[1] * (distortion.ndim - 1), values.shape[-1])
-
-
-def rays(points: FloatArray, distortion: FloatArray, focal: FloatArray | float = 1.0) -> FloatArray:
-    """Unit rays (3, 2, k, b) of points (2, 2, k, b) for one λ and one focal length a sample."""
-    directions = np.concatenate([points, (focal * (1.0 + distortion * squared_radii(points)))[None]])
-    unit: FloatArray = directions / np.sqrt((directions * directions).sum(axis=0))
-    return unit
 
 
 def rotation_of_two(bundle: FloatArray) -> FloatArray:
@@ -86,13 +78,6 @@ def rotation_of_two(bundle: FloatArray) -> FloatArray:
     return rotation
 
 
-def with_focal(rotation: FloatArray, focal: FloatArray) -> FloatArray:
-    """``K R K⁻¹``, ``K = diag(g, g, 1)``, of rotations (b, 3, 3) and focal lengths (b,)."""
-    k = np.stack([focal, focal, np.ones_like(focal)], axis=-1)
-    homography: FloatArray = rotation * (k[:, :, None] / k[:, None, :])
-    return homography
-
-
 def turned_solutions(
     points: FloatArray,
     sample: IndexArray,
@@ -101,12 +86,13 @@ def turned_solutions(
     rotate: Callable[[FloatArray], FloatArray],
 ) -> Solutions:
     """Solutions from λ and focal lengths (b,) of points (2, 2, k, b); those that leave a point behind are left out."""
-    bundle = rays(points, distortion, focal)
+    bundle = _unit(np.concatenate([points, (focal * (1.0 + distortion * squared_radii(points)))[None]]))
     rotation = rotate(bundle)
     # In front of the camera of image 2, whatever the errors of a sample that no rotation fits.
     ahead = np.einsum("bj,jkb->kb", rotation[:, 2], bundle[:, 0])
     kept = np.flatnonzero((ahead > 0.0).all(axis=0) & np.isfinite(rotation).all(axis=(1, 2)))
-    homography = with_focal(rotation[kept], focal[kept])
+    k = np.stack([focal, focal, np.ones_like(focal)], axis=-1)[kept]
+    homography = rotation[kept] * (k[:, :, None] / k[:, None, :])  # K R K⁻¹ with K = diag(g, g, 1)
     return Solutions(sample[kept], homography, distortion[kept], focal[kept])
 
 

@@ -1,13 +1,11 @@
 """Two points, rotation about the centre, known focal length: λ from the one angle between them."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.division_model import SOLVED_DISTORTION
-from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
+from rdstitch.solvers.batch import IndexArray, solve_in_blocks
 from rdstitch.solvers.plane import lens_range
 from rdstitch.solvers.rays import RayPairs, rotation_of_two, turned_solutions
 from rdstitch.solvers.roots import real_roots
@@ -48,22 +46,10 @@ def rotation_two_point(
 
     def solve(points: FloatArray, _: IndexArray) -> Solutions:
         pairs = RayPairs.between(points[:, :, :1], points[:, :, 1:])
-        index, distortion = real_roots(_AngleEquation(pairs), _DEGREE, *lens_range(points, distortion_range))
+        index, distortion = real_roots(pairs, _DEGREE, *lens_range(points, distortion_range))
         possible = pairs.take(index).same_side(distortion, np.ones_like(distortion))
         index, distortion = index[possible], distortion[possible]
         points = np.take(points, index, axis=-1)
         return turned_solutions(points, index, distortion, np.ones_like(distortion), rotation_of_two)
 
     return solve_in_blocks(solve, x1, x2, 2)
-
-
-@dataclass(frozen=True)
-class _AngleEquation(SampleArrays):
-    """The equation of :func:`rotation_two_point`."""
-
-    pairs: RayPairs
-
-    def polynomial(self, distortion: FloatArray) -> FloatArray:
-        """The equation itself."""
-        value: FloatArray = self.pairs.tangents_differ(distortion, np.ones(()))[0]
-        return value

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, Rows
-from rdstitch.errors import ArgumentError
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,16 +38,3 @@ class Solutions(Rows):
     def empty(cls) -> Self:
         """No solution."""
         return cls(np.empty(0, dtype=np.intp), np.empty((0, 3, 3)), np.empty(0))
-
-
-def as_samples(x1: ArrayLike, x2: ArrayLike, count: int) -> tuple[FloatArray, FloatArray]:
-    """Check samples of ``count`` normalized points of both images, and give a single one its batch axis.
-
-    ArgumentError when a shape is not (B, count, 2) or (count, 2).
-    """
-    a, b = np.asarray(x1, dtype=np.float64), np.asarray(x2, dtype=np.float64)
-    if a.shape != b.shape or a.ndim not in (2, 3) or a.shape[-2:] != (count, 2):
-        raise ArgumentError(
-            f"expected two arrays of shape (B, {count}, 2) or ({count}, 2), not {a.shape} and {b.shape}"
-        )
-    return a.reshape(-1, count, 2), b.reshape(-1, count, 2)

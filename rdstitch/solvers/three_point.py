@@ -10,10 +10,9 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.division_model import SOLVED_DISTORTION
 from rdstitch.solvers.batch import IndexArray, SampleArrays, solve_in_blocks
-from rdstitch.solvers.lines import Lines, squared_radii, triangle_determinants
+from rdstitch.solvers.lines import Lines, mirrored, oriented_samples, squared_radii, triangle_determinants
 from rdstitch.solvers.plane import TiltRotations, lens_range, motion_homography
 from rdstitch.solvers.solutions import Solutions
-from rdstitch.solvers.triangle_orientation import mirrored, oriented_samples
 
 RealArray = NDArray[np.floating[Any]]
 

@@ -8,11 +8,10 @@ from numpy.typing import ArrayLike
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.division_model import SOLVED_DISTORTION
 from rdstitch.solvers.batch import IndexArray, SampleArrays, sample_count, solve_in_blocks
-from rdstitch.solvers.lines import Lines, triangle_determinants
+from rdstitch.solvers.lines import Lines, mirrored, oriented_samples, triangle_determinants
 from rdstitch.solvers.plane import TiltRotations, depths, differences, motion_homography, visible_range
 from rdstitch.solvers.roots import real_roots
 from rdstitch.solvers.solutions import Solutions
-from rdstitch.solvers.triangle_orientation import mirrored, oriented_samples
 
 _DEGREE = 8
 

@@ -1,6 +1,6 @@
-"""All places at once: links by what they show, and the stage as a prior whose variances the grid itself tells.
+"""All places at once: links by their matches, and the stage as a prior whose variances are estimated from the grid.
 
-A tile lies at ``t = A n + row + column + ε``: n is where the stage was told to go, A the camera's turn and scale
+A tile lies at ``t = A n + row + column + ε``: n is its nominal place, A the camera's turn and scale
 against the stage's axes, row and column what each line is off as a whole (backlash), ε the rest. The variances of
 these three are estimated with the places (expectation maximization), so that a tile without links has the place that
 the model of the stage gives it.
@@ -22,7 +22,7 @@ _WIDTH = 4.0  # standard deviations at which a link counts a quarter: Geman and 
 _SQUARED_MEDIAN = RAYLEIGH_MEDIAN**2  # of the sum of two squared standard normal numbers
 _PAIR_STD = 0.03  # standard deviation of an error that all blocks of a pair share, pixels, before it is estimated
 _AGREEING_WEIGHT = 0.1  # of a block from which on the noise is also by it
-_MIN_NOISE = 0.1  # of the variances that blocks are said to have
+_MIN_NOISE = 0.1  # of the variances that blocks have by their information
 _SAMPLES = 16  # draws from the posterior, to estimate the variances of the stage
 _RESULT_SAMPLES = 64  # draws in the result, so that every ± that is made of them is itself known to 9 %
 HOLDING_WEIGHT = 0.25  # of a block, or a pair, from which on it holds its tiles

@@ -47,14 +47,6 @@ class _Axis:
         return chosen
 
 
-@dataclass(frozen=True, eq=False)
-class _Step:
-    """From one column or row of the grid to the next, pixels (2,)."""
-
-    nominal: FloatArray
-    measured: FloatArray  # by the tiles
-
-
 def with_measured_axes(
     grid: TileGrid, read: Callable[[int], CoarseTile], factor: int, search: float
 ) -> tuple[TileGrid, str]:
@@ -73,14 +65,15 @@ def with_measured_axes(
         np.abs(measured - step).max() <= search for measured, step in zip(best, nominal, strict=True)
     ):
         return grid, ""
-    steps = {k: _Step(axis.step, measured) for (k, axis), measured in zip(axes.items(), best, strict=True)}
-    steps = _completed(steps, axes, search)
-    before, after = np.eye(2), np.eye(2)
-    for k, step in steps.items():
-        before[k], after[k] = step.nominal, step.measured
+    before, after = np.eye(2), np.eye(2)  # rows: from one column, or row, of the grid to the next, pixels
+    for (k, axis), measured in zip(axes.items(), best, strict=True):
+        before[k], after[k] = axis.step, measured
+    for k, axis in axes.items():
+        if len(axes) == 2 and axis.evidence(best[k], search) == 0.0:
+            after[k] = _across(before[k], before[1 - k], best[1 - k])
     places = grid.places @ np.linalg.solve(before, after)
     turned = replace(grid, places=places - places.min(axis=0))
-    return turned, _in_words(steps, grid.size)
+    return turned, _in_words({k: (before[k], after[k]) for k in axes}, grid.size)
 
 
 def _axis(grid: TileGrid, axis: int, read: Callable[[int], CoarseTile], factor: int) -> _Axis | None:
@@ -113,27 +106,22 @@ def _perpendicular(x: FloatArray, y: FloatArray) -> bool:
     return bool(abs(x @ y) <= math.sin(_MAX_SKEW) * np.linalg.norm(x) * np.linalg.norm(y))
 
 
-def _completed(steps: Mapping[int, _Step], axes: Mapping[int, _Axis], search: float) -> dict[int, _Step]:
-    """The steps; one that no pair shows follows the other in direction and length."""
-    completed = dict(steps)
-    for k, step in steps.items():
-        if 1 - k in steps and axes[k].evidence(step.measured, search) == 0.0:
-            other = steps[1 - k]
-            # Perpendicular, on the side of the nominal one if there is such a side.
-            longer = float(np.linalg.norm(step.nominal) / np.linalg.norm(other.nominal))
-            across = np.array([-other.measured[1], other.measured[0]]) * longer
-            completed[k] = _Step(step.nominal, across if float(across @ step.nominal) >= 0.0 else -across)
-    return completed
+def _across(nominal: FloatArray, other: FloatArray, other_measured: FloatArray) -> FloatArray:
+    """A step that no pair shows, by the other one: as long relative to that as nominally, and perpendicular to it."""
+    longer = float(np.linalg.norm(nominal) / np.linalg.norm(other))
+    across = np.array([-other_measured[1], other_measured[0]]) * longer
+    # On the side of the nominal one if there is such a side.
+    return across if float(across @ nominal) >= 0.0 else -across
 
 
-def _in_words(steps: Mapping[int, _Step], size: tuple[int, int]) -> str:
-    """What is not as it was given: directions, and overlaps."""
-    said, overlaps = [], []
-    for k, step in steps.items():
-        along = int(np.abs(step.measured).argmax())
+def _in_words(steps: Mapping[int, tuple[FloatArray, FloatArray]], size: tuple[int, int]) -> str:
+    """What is not as it was given, by nominal and measured steps of each axis: directions, and overlaps."""
+    differences, overlaps = [], []
+    for k, (nominal, measured) in steps.items():
+        along = int(np.abs(measured).argmax())
         if along != k:
-            said.append(f"{('columns', 'rows')[k]} lie {'below' if along else 'beside'} each other")
-        if step.measured[along] * step.nominal[k] < 0.0:
-            said.append(f"the next {('column', 'row')[k]} is {('left', 'above')[along]}")
-        overlaps.append(f"{100.0 * (1.0 - abs(step.measured[along]) / size[along]):.1f}")
-    return f"{', '.join([*said, ''])}neighbours overlap by {' and '.join(overlaps)} %"
+            differences.append(f"{('columns', 'rows')[k]} lie {'below' if along else 'beside'} each other")
+        if measured[along] * nominal[k] < 0.0:
+            differences.append(f"the next {('column', 'row')[k]} is {('left', 'above')[along]}")
+        overlaps.append(f"{100.0 * (1.0 - abs(measured[along]) / size[along]):.1f}")
+    return f"{', '.join([*differences, ''])}neighbours overlap by {' and '.join(overlaps)} %"

@@ -29,9 +29,7 @@ class LinkedPoints:
 
     pair: IntArray  # (M,), int: pair of each block
     tiles: IntArray  # (P, 2), int: tiles of each pair
-    points1: FloatArray  # points1, points2: (M, 2): measured pixels of the two tiles
-    points2: FloatArray
-    information: FloatArray  # (M, 2, 2)
+    blocks: BlockMatches  # of all pairs, M
 
     @classmethod
     def of(cls, pairs: IntArray, matches: Mapping[int, BlockMatches]) -> "LinkedPoints":
@@ -40,17 +38,13 @@ class LinkedPoints:
         return cls(
             np.repeat(np.arange(-1, len(matches)), [len(match) for match in blocks]),
             pairs[list(matches)],
-            np.concatenate([match.points1 for match in blocks]),
-            np.concatenate([match.points2 for match in blocks]),
-            np.concatenate([match.information for match in blocks]),
+            BlockMatches.concatenate(blocks),
         )
 
     def of_pairs(self, wanted: BoolArray) -> "LinkedPoints":
         """The matches of some of the pairs (P,)."""
         kept = wanted[self.pair]
-        number = np.cumsum(wanted) - 1
-        parts = (values[kept] for values in (self.points1, self.points2, self.information))
-        return LinkedPoints(number[self.pair[kept]], self.tiles[wanted], *parts)
+        return LinkedPoints((np.cumsum(wanted) - 1)[self.pair[kept]], self.tiles[wanted], self.blocks.take(kept))
 
     def medians(self, values: FloatArray) -> FloatArray:
         """Medians (P,) over the blocks of each pair: of a wrong one all are off, of a right one a few may be."""
@@ -104,7 +98,7 @@ class StageEquations:
         self._entry = StageState.of(np.arange(size), self._sizes)  # of each unknown, its number in the vector
         self._solved = size if free_lens else size - 1
         # Inverse square roots of the blocks' covariances, which are not better than blocks can be.
-        information = links.information
+        information = links.blocks.information
         covariance = np.linalg.inv(information + 1e-12 * np.eye(2)) if len(information) else information
         self.root = np.linalg.cholesky(np.linalg.inv(covariance + _MIN_STD**2 * np.eye(2))).transpose(0, 2, 1)
         entry = self._entry
@@ -139,8 +133,8 @@ class StageEquations:
 
     def errors(self, state: StageState, *, of_blocks: bool = False) -> tuple[FloatArray, FloatArray]:
         """Residuals (M, 2), or what of them is not common to all blocks of a pair, and their derivatives by λ."""
-        one, by_one = self._undistorted(self.links.points1, state.lens)
-        two, by_two = self._undistorted(self.links.points2, state.lens)
+        one, by_one = self._undistorted(self.links.blocks.points1, state.lens)
+        two, by_two = self._undistorted(self.links.blocks.points2, state.lens)
         moved = (self._by_blocks if of_blocks else self._by_pairs) @ state.vector
         return one - two + moved.reshape(-1, 2), by_one - by_two
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.arrays import FloatArray, IntArray, Rows
 from rdstitch.stage.coarse_tile import CORRELATED, Image
 
 _SMOOTHING = 1.2  # standard deviation of the filter before derivatives are taken, pixels
@@ -26,7 +26,7 @@ Gradient = list[Image]
 
 
 @dataclass(frozen=True, eq=False)
-class BlockMatches:
+class BlockMatches(Rows):
     """Matches of the blocks of overlaps."""
 
     # points1, points2: (M, 2): measured places of the same content in the first and the second tile, pixels
@@ -54,22 +54,19 @@ def refine(
 ) -> BlockMatches:
     """Refine where blocks (K, 4) of the first tile (h, w) are in the second; ``tolerance`` pixels off at most."""
     matches = [match for block in blocks if (match := _refined(first, second, block, transfer, tolerance)) is not None]
-    if not matches:
-        return BlockMatches.none()
-    points1, points2, information = (np.array(values) for values in zip(*matches, strict=True))
-    return BlockMatches(points1, points2, information)
+    return BlockMatches.concatenate([BlockMatches.none(), *matches])
 
 
 def _refined(
     first: NDArray[Any], second: NDArray[Any], block: IntArray, transfer: PointMap, tolerance: float
-) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Places of a block's content in both tiles and their information; None where it shows nothing."""
+) -> BlockMatches | None:
+    """The match of one block; None where it shows nothing."""
     pair = _sampled_pair(first, second, block, transfer)
     found = None if pair is None else _displaced(pair, min(tolerance, _MARGIN - 2.0))
     if pair is None or found is None or not found.significant:
         return None
-    point = pair.low + _centroid(found.gradient)
-    return point, transfer(point[None])[0] - found.shift, found.information
+    point = (pair.low + _centroid(found.gradient))[None]
+    return BlockMatches(point, transfer(point) - found.shift, found.information[None])
 
 
 @dataclass(frozen=True, eq=False)

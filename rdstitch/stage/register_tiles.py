@@ -9,6 +9,7 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
+from rdstitch.matching.match_graph import connected_components
 from rdstitch.stage.adjustment import HOLDING_WEIGHT, Adjustment, adjust
 from rdstitch.stage.choose_places import choose_places
 from rdstitch.stage.equations import LinkedPoints
@@ -16,7 +17,6 @@ from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.overlap import Overlap
 from rdstitch.stage.pair_candidates import PairFinder, Reader, SearchPlan, in_pairs
 from rdstitch.stage.refinement import BlockMatches, PointMap, refine
-from rdstitch.system.late_imports import csgraph, sparse
 from rdstitch.system.progress import Progress, silent
 
 _MAX_STD = 1.0  # coarse pixels: a refined place that is less sure than that was not found
@@ -35,12 +35,15 @@ class TileRegistration:
     adjustment: Adjustment
     links: LinkedPoints  # blocks of all pairs that show something
     compared: IntArray  # (Q, 2), int: all pairs that were compared
-    # (N,), bool: tiles that links hold; the others have the place that the model of the stage gives them
-    linked: BoolArray
     groups: tuple[tuple[int, ...], ...]  # tiles that links hold together, the largest group first
     search: float  # how far neighbours were looked for, pixels
     z: int | Literal["max"] | None = None  # z, time: plane and time of the files that were read, where they were chosen
     time: int | None = None
+
+    @property
+    def linked(self) -> BoolArray:
+        """Which tiles links hold (N,); the others have the place that the model of the stage gives them."""
+        return np.isin(np.arange(len(self.grid)), [tile for group in self.groups for tile in group])
 
     @property
     def stds(self) -> FloatArray:
@@ -91,7 +94,11 @@ def register_tiles(
                 break
         progress("refining", count + 1, len(chosen))
     links = LinkedPoints.of(pairs, matches)
-    return _result(plan, pairs, links, _with_lens(plan, links, lens, distortion))
+    fitted = _with_lens(plan, links, lens, distortion)
+    held = links.tiles[fitted.weights > HOLDING_WEIGHT]
+    groups = connected_components(len(plan.grid), *held.T)
+    together = tuple(tuple(group) for group in groups if len(group) > 1)
+    return TileRegistration(plan.grid, fitted, links, pairs, together, plan.search)
 
 
 def _with_lens(
@@ -134,14 +141,3 @@ def _transfer(overlap: Overlap, offset: FloatArray, camera: Camera) -> PointMap:
     middle = overlap.centers
     between = (camera.undistort(middle) - camera.undistort(middle - offset)).mean(axis=0)
     return lambda points: camera.distort(camera.undistort(points) - between)
-
-
-def _result(plan: SearchPlan, pairs: IntArray, links: LinkedPoints, fitted: Adjustment) -> TileRegistration:
-    grid = plan.grid
-    held = links.tiles[fitted.weights[: len(links.tiles)] > HOLDING_WEIGHT]
-    joined = sparse.coo_matrix((np.ones(len(held)), held.T), shape=(len(grid),) * 2)
-    count, label = csgraph.connected_components(joined, directed=False)
-    groups = [np.flatnonzero(label == k) for k in range(count)]
-    groups = sorted((group for group in groups if len(group) > 1), key=len, reverse=True)
-    linked = np.isin(np.arange(len(grid)), held)
-    return TileRegistration(grid, fitted, links, pairs, linked, tuple(tuple(g.tolist()) for g in groups), plan.search)

@@ -71,7 +71,8 @@ class Relief:
         def in_ground(level: NDArray[np.float32]) -> NDArray[np.bool_]:
             places = start + along * (np.float32(1.0) - level / np.float32(height))[..., None]
             places[np.isnan(places)] = NOWHERE
-            ground = _interpolate(self.height, places[..., 0], places[..., 1], bottom)
+            outside = cv2.BORDER_CONSTANT, (bottom, 0.0, 0.0, 0.0)
+            ground = cv2.remap(self.height, places[..., 0], places[..., 1], cv2.INTER_LINEAR, None, *outside)
             return np.asarray(ground >= level)
 
         above = np.full(flat.shape[:2], top, dtype=np.float32)
@@ -129,14 +130,6 @@ def ridges(size: tuple[int, int], seed: int, *, height: float, width: int = 400)
 
 RELIEFS: dict[str, Callable[..., Relief]] = {"bumps": hills, "buildings": boxes, "slopes": ridges}
 """Makers of relief by the kind of ground; each takes ``(size, seed, height=...)``."""
-
-
-def _interpolate(values: HeightMap, x: NDArray[np.float32], y: NDArray[np.float32], outside: float) -> HeightMap:
-    """Values between texels, linearly."""
-    between = cv2.remap(
-        values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(outside, 0.0, 0.0, 0.0)
-    )
-    return np.asarray(between, dtype=np.float32)
 
 
 def _scaled(ground: HeightMap, height: float) -> HeightMap:

@@ -7,6 +7,6 @@ steering; loops are closed and every pair is used when the whole sequence is reg
 from rdstitch.tracking.placement import CameraPose, Placement, PlaneSimilarity
 from rdstitch.tracking.preview import Preview
 from rdstitch.tracking.tracked_frame import TrackingResult
-from rdstitch.tracking.tracker import FrameTracker, TrackingOptions
+from rdstitch.tracking.tracker import FrameTracker
 
-__all__ = ["CameraPose", "FrameTracker", "Placement", "PlaneSimilarity", "Preview", "TrackingOptions", "TrackingResult"]
+__all__ = ["CameraPose", "FrameTracker", "Placement", "PlaneSimilarity", "Preview", "TrackingResult"]

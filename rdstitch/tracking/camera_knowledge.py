@@ -15,7 +15,6 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.delays import DELAY_STD, at_delay, change_with_delay
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
-from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
 from rdstitch.tracking.metric_plane import MetricPlane
 from rdstitch.tracking.placement import YAW, CameraPose, Placement
@@ -23,20 +22,6 @@ from rdstitch.tracking.tracked_frame import Frame, TrackedFrame
 
 _KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of an image of 640 x 480 pixels, over half of it
 _MIN_KEYFRAMES_FOR_LENS = 12  # keyframes that λ is not known before
-
-
-@dataclass(frozen=True)
-class CameraRevision:
-    """What keyframes show of a camera whose focal length was given, and what that changes for the frames before."""
-
-    focal: float  # half diagonals
-    length_std: float
-    plane: MetricPlane | None
-    delay: float  # delay, delay_std: s
-    delay_std: float
-    length_factor: float | None = None  # by which lengths change as all keyframes are placed again; None: none are
-    report_again: bool = False  # whether earlier frames are reported again, as their lengths are far surer
-    messages: tuple[Message, ...] = ()
 
 
 @dataclass
@@ -109,14 +94,6 @@ class CameraKnowledge:
         assert frame.attitude is not None
         late = self.delay_std * float(change_with_delay(frame.attitude).max())
         return math.hypot(self.given.attitudes_std, late)
-
-    def revise(self, revision: CameraRevision) -> None:
-        """Take over what keyframes show."""
-        self.delay, self.delay_std = revision.delay, revision.delay_std
-        self.focal_contradicted |= revision.focal != self.focal
-        self.focal, self.length_std, self.plane = revision.focal, revision.length_std, revision.plane
-        if revision.report_again:
-            self.given_length_std = self.length_std
 
     def vote(self, links: Sequence[Link]) -> None:
         """λ by the pairs alone, until there is an alignment."""

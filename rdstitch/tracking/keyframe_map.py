@@ -13,7 +13,6 @@ from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.frame_links import MATCH_ERROR, fitted_homography, links_by_corners, links_by_features
 from rdstitch.tracking.metric_plane import chained
 from rdstitch.tracking.placement import Placement, PlaneSimilarity
-from rdstitch.tracking.state import TrackState
 from rdstitch.tracking.tracked_frame import Frame, FramePlace, TrackedFrame
 
 _WINDOW = 48  # last keyframes, that are aligned together
@@ -22,22 +21,28 @@ _SEARCHED = 12  # keyframes among which a lost frame looks at a time
 _PARTNERS = 2  # last keyframes that a frame is matched with
 _REVISED = 500  # frames between keyframes, whose places are revised with those of the keyframes
 _ROUGH = 0.02  # sides: how far a corner may be off from frame to frame, or while the lens is not known
+_MAX_LOST_FRAMES = 10  # frames in a row without a place, after which a new map begins, if all keyframes were searched
 
 
 @dataclass(eq=False)
 class KeyframeMap:
-    """Keyframes in the order in which they came, or were found again, and what is known of their camera."""
+    """Keyframes in the order in which they came, or were found again, and what is known of their camera.
+
+    The track is initialising until the map has a plane, and lost while no keyframe shows the latest frames.
+    """
 
     knowledge: CameraKnowledge
-    state: TrackState
     keyframes: list[TrackedFrame]  # the last ones
+    number: int = 0  # of the map
+    has_plane: bool = False  # whether keyframes lie on a plane
+    lost_frames: int = 0  # the last ones, which no keyframe shows
     older: list[TrackedFrame] = field(default_factory=list)
     links: list[Link] = field(default_factory=list)  # between the last ones
     # frames between keyframes, and the points of a keyframe that they show: before and now
     between: deque[tuple[TrackedFrame, TrackedFrame, FloatArray, FloatArray]] = field(
         default_factory=lambda: deque(maxlen=_REVISED)
     )
-    seen: int = 0  # keyframes after the first
+    added: int = 0  # keyframes after the first
     searched: int = 0  # keyframes among which a lost frame has looked for its place
 
     def add(self, frame: TrackedFrame, links: Sequence[Link]) -> None:
@@ -47,7 +52,7 @@ class KeyframeMap:
         frame.keyframe = True
         self.older = [*self.older, *self.keyframes[: -_WINDOW + 1]][-_KEPT:]
         self.keyframes = [*self.keyframes, frame][-_WINDOW:]
-        self.seen += 1
+        self.added += 1
         kept = {keyframe.number for keyframe in self.keyframes}
         self.links = [link for link in (*self.links, *links) if link.image1 in kept and link.image2 in kept]
 
@@ -97,15 +102,21 @@ class KeyframeMap:
     def _to_search(self) -> list[TrackedFrame]:
         """Further keyframes for a frame without a place, others each time while the track is lost."""
         further = [*self.keyframes[:-_PARTNERS][::-1], *self.older[::-1]]
-        start = self.searched % max(len(further), 1) if self.state.lost else 0
+        start = self.searched % max(len(further), 1) if self.lost_frames else 0
         chosen = further[start : start + _SEARCHED]
-        self.searched = len(chosen) + (self.searched if self.state.lost else 0)
+        self.searched = len(chosen) + (self.searched if self.lost_frames else 0)
         return chosen
 
     @property
-    def all_searched(self) -> bool:
-        """Whether a lost frame was compared with all."""
-        return self.searched >= len(self.older) + max(len(self.keyframes) - _PARTNERS, 0)
+    def next_number(self) -> int | None:
+        """Of the map that a frame begins which none of the keyframes shows; None while it is too early for one.
+
+        A first keyframe that no frame shows is replaced.
+        """
+        if not self.has_plane and len(self.keyframes) == 1:
+            return self.number
+        all_searched = self.searched >= len(self.older) + max(len(self.keyframes) - _PARTNERS, 0)
+        return self.number + 1 if self.lost_frames >= _MAX_LOST_FRAMES and all_searched else None
 
     def place(
         self, frame: Frame, other: TrackedFrame, before: FloatArray, now: FloatArray, *, rough: bool = False
@@ -113,7 +124,7 @@ class KeyframeMap:
         """Where a frame lies by points (N, 2) of a keyframe that it shows too; None where no homography fits them."""
         start, knowledge = other.place, self.knowledge
         camera = knowledge.camera_with_lens_of(start.placement, frame)
-        rough |= self.state.initialising and not knowledge.distortion_known
+        rough |= not (self.has_plane or knowledge.distortion_known)
         error = _ROUGH * max(frame.camera.image_size) if rough else MATCH_ERROR
         homography, inliers = fitted_homography(start.placement.camera, camera, before, now, error)
         if homography is None:
@@ -145,14 +156,14 @@ class KeyframeMap:
         unconfirmed = len(self.keyframes) == 1 and not first.place.aligned and self.knowledge.plane is not None
         if not unconfirmed or second.place.covariance is None:
             return None
-        self.state = self.state.with_plane()
+        self.has_plane = True
         for frame in (first, second):
             frame.place = replace(frame.place, aligned=True)
         return first
 
     def align(self, placements: Mapping[int, Placement]) -> None:
         """Move keyframes, by number, to where an alignment has them."""
-        self.state = self.state.with_plane()
+        self.has_plane = True
         for number, keyframe in self.by_number.items():
             if number in placements:
                 keyframe.place = replace(keyframe.place, placement=placements[number], aligned=True, predicted=False)
@@ -178,7 +189,7 @@ class KeyframeMap:
         below = move.applied(self.knowledge.plane.below(first.frame.camera, self.knowledge.attitude(first.frame)))
         covariance = np.zeros((4, 4)) if first.place.covariance is None else first.place.covariance
         first.place = replace(first.place, placement=below, aligned=True, covariance=covariance)
-        self.state, enlarge = self.state.with_plane(), PlaneSimilarity(length_factor, 0.0)
+        self.has_plane, enlarge = True, PlaneSimilarity(length_factor, 0.0)
         for keyframe in (*self.older, *others):
             keyframe.place = replace(keyframe.place, placement=enlarge.applied(keyframe.place.placement))
         for keyframe in others:

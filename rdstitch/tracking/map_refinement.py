@@ -53,7 +53,7 @@ class MapRefinement:
     def start_map(self) -> None:
         """Forget what belongs to the last map."""
         self._next = _FIRST
-        self._taken_over_at = 0  # keyframes seen from which on the alignment is
+        self._taken_over_at = 0  # keyframes after the first from which on the alignment is
         self.drop()
 
     def drop(self) -> None:
@@ -64,21 +64,19 @@ class MapRefinement:
 
     def begin_if_due(self, keyframe_map: KeyframeMap) -> None:
         """Begin the next alignment of a map to which a keyframe was added, if it is time for it."""
-        if keyframe_map.seen + 1 < self._next or self._window is not None:
+        if keyframe_map.added + 1 < self._next or self._window is not None:
             return
         lens_known = keyframe_map.knowledge.distortion_known
         grown = max(2, round(self._next * (_GROWTH - 1.0)))
         self._next += _INTERVAL if lens_known else min(grown, _INTERVAL)
         # At a keyframe and not when it is done: so that time does not decide on the result.
-        self._taken_over_at = keyframe_map.seen + (
-            _DELAY if lens_known and keyframe_map.state.has_plane else _FIRST_DELAY
-        )
+        self._taken_over_at = keyframe_map.added + (_DELAY if lens_known and keyframe_map.has_plane else _FIRST_DELAY)
         self.begin(keyframe_map)
 
     def begin(self, keyframe_map: KeyframeMap) -> None:
         """Begin to align the last keyframes among themselves."""
         window, knowledge, keeps_focal = list(keyframe_map.keyframes), keyframe_map.knowledge, keyframe_map.keeps_focal
-        executor = self._executor if keyframe_map.state.has_plane else self._first_executor
+        executor = self._executor if keyframe_map.has_plane else self._first_executor
         frames = [keyframe.frame for keyframe in window]
         options = replace(knowledge.options_for(frames), max_matches_per_link=_MATCHES, reference=None)
         cameras = knowledge.cameras_for(frames, _EXACT if keeps_focal else None)
@@ -123,9 +121,9 @@ class MapRefinement:
             return None
         return alignment
 
-    def is_waited_for(self, seen: int) -> bool:
-        """Whether the alignment is taken over when so many keyframes have been seen."""
-        return self.patient and seen >= self._taken_over_at
+    def is_waited_for(self, added: int) -> bool:
+        """Whether the alignment is taken over when so many keyframes were added to the first."""
+        return self.patient and added >= self._taken_over_at
 
 
 def _on_map(keyframe_map: KeyframeMap, window: _Window, alignment: Alignment) -> tuple[dict[int, Placement], float]:

@@ -98,19 +98,16 @@ class LivePreview:
         if self._failed:
             return []
         try:
-            self._add(source, result)
+            if result.keyframe and result.placement is not None:
+                image = source.read(source.reduction(_MEGAPIXELS))
+                self._mosaic.paint(image.pixels, result.placement)
+                self._changed = True
+            if monotonic() - self._written >= self._refresh:
+                self.write()
         except RdstitchError as error:
             self._failed = True
             return [Message(f"no preview any more: {error}")]
         return []
-
-    def _add(self, source: Source, result: TrackingResult) -> None:
-        if result.keyframe and result.placement is not None:
-            image = source.read(source.reduction(_MEGAPIXELS))
-            self._mosaic.paint(image.pixels, result.placement)
-            self._changed = True
-        if monotonic() - self._written >= self._refresh:
-            self.write()
 
     def write(self) -> None:
         """Replace the file, if there is anything new."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -18,7 +18,7 @@ from rdstitch.tracking.placement import CameraPose, Placement
 
 MIN_INLIERS = 15
 _GRID = 8  # points a side by which it is measured how much two frames share
-_NO_IMAGE = prepare(View(np.zeros((1, 1), np.uint8)), None)  # of frames that are not looked at again
+NO_IMAGE = prepare(View(np.zeros((1, 1), np.uint8)), None)  # of frames that are not looked at again
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,6 @@ class Frame:
     def textured(self) -> bool:
         """Whether it shows enough to be placed by."""
         return len(self.corners) >= MIN_INLIERS or len(self.features) >= MIN_INLIERS
-
-    def without_image(self) -> "Frame":
-        """The same where its image is not looked at again."""
-        return replace(self, image=_NO_IMAGE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -17,47 +17,44 @@ from rdstitch.inputs.odometry import BodyPose
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
-from rdstitch.tracking.camera_check import check_camera
+from rdstitch.tracking.camera_check import revise_camera
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.frame_links import agree
 from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.map_refinement import MapRefinement
 from rdstitch.tracking.odometry_prediction import OdometryPrediction
 from rdstitch.tracking.placement import Placement
-from rdstitch.tracking.state import TrackState
-from rdstitch.tracking.tracked_frame import Frame, FramePlace, TrackedFrame, TrackingResult
+from rdstitch.tracking.tracked_frame import NO_IMAGE, Frame, FramePlace, TrackedFrame, TrackingResult
 
 _PATIENCE = 0.015  # seconds a frame that are waited for the first alignment
 _KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below which it becomes a keyframe
-
-
-@dataclass(frozen=True)
-class TrackingOptions:
-    """Choices and knowledge of a tracker."""
-
-    pair: EstimationOptions = field(default_factory=EstimationOptions)  # with λ, where it is known
-    # with the λ of the cameras if ``pair`` has one
-    alignment: AlignmentOptions = field(default_factory=AlignmentOptions)
-    # whether alignments are waited for: the same frames give the same poses; else no frame waits long
-    patient: bool = True
 
 
 class FrameTracker:
     """Registers frames of one camera one after the other.
 
     Features (``detect``, in a frame's pixels; ``match``) are asked for only where the corners of the last keyframe,
-    followed from frame to frame, do not place a frame. Keyframes are aligned by ``executor`` while further frames come.
+    followed from frame to frame, do not place a frame. Keyframes are aligned by ``executor`` while further frames come;
+    where a tracker is ``patient`` these are waited for, so that the same frames give the same poses, else no frame
+    waits long. Where λ is known both options have it.
     """
 
     def __init__(
-        self, options: TrackingOptions, detect: Callable[[PreparedImage], Features], match: Matcher, executor: Executor
+        self,
+        pair: EstimationOptions,
+        alignment: AlignmentOptions,
+        detect: Callable[[PreparedImage], Features],
+        match: Matcher,
+        executor: Executor,
+        *,
+        patient: bool = True,
     ) -> None:
         self._detect, self._match, self._count = detect, match, 0
         self.messages: list[Message] = []  # what the user should know of what has come so far
-        self._knowledge = CameraKnowledge.of(options.alignment, options.pair)
+        self._knowledge = CameraKnowledge.of(alignment, pair)
         self._flow, self._odometry = CornerFlow(), OdometryPrediction()
-        self._map = KeyframeMap(self._knowledge, TrackState(), [])
-        self._refinement = MapRefinement(executor, patient=options.patient, report=self._report)
+        self._map = KeyframeMap(self._knowledge, [])
+        self._refinement = MapRefinement(executor, patient=patient, report=self._report)
 
     @property
     def revisable(self) -> set[int]:
@@ -75,15 +72,15 @@ class FrameTracker:
         frame = Frame(self._count, camera, image, self._detect, attitude, body, self._flow.is_static)
         self._count += 1
         if not self._map.keyframes:
-            return [self._first(frame, self._map.state)]
-        patience = _PATIENCE if self._map.state.initialising else 0.0
+            return [self._first(frame, 0)]
+        patience = 0.0 if self._map.has_plane else _PATIENCE
         revised = [] if self._refinement.patient else self._take_over(None, patience)
         return [*revised, *self._registered(frame)]
 
     def finish(self) -> list[TrackingResult]:
         """Frames that find their place, or another one, when no other frame comes."""
         results, keyframe_map = self._take_over(None, None), self._map
-        refinable = keyframe_map.state.initialising or self._knowledge.plane is not None
+        refinable = not keyframe_map.has_plane or self._knowledge.plane is not None
         if len(keyframe_map.keyframes) > 1 and not keyframe_map.keeps_focal and refinable:
             self._refinement.begin(keyframe_map)
             results += self._take_over(None, None)
@@ -106,10 +103,10 @@ class FrameTracker:
         if placed.place.pose is not None and frame.body is not None:
             self._odometry.latest = placed
         if not placed.keyframe:
-            placed.frame = frame.without_image()
+            placed.frame = replace(frame, image=NO_IMAGE)
         return results
 
-    def _first(self, frame: Frame, state: TrackState) -> TrackingResult:
+    def _first(self, frame: Frame, map_number: int) -> TrackingResult:
         """The first keyframe of a map."""
         knowledge, self._odometry.latest = self._knowledge, None
         camera = knowledge.camera_of(frame)
@@ -119,15 +116,15 @@ class FrameTracker:
         if knowledge.plane is not None:
             place = FramePlace(knowledge.plane.below(camera, knowledge.attitude(frame)), covariance=np.zeros((4, 4)))
         first = TrackedFrame(frame, place, keyframe=True)
-        self._map = KeyframeMap(knowledge, state, [first])
+        self._map = KeyframeMap(knowledge, [first], map_number)
         self._refinement.start_map()
         self._flow.begin(frame.image, frame.corners)
-        reason = "first frame" if not state.map_number else "no keyframe shows what it shows: it begins a new map"
+        reason = "first frame" if not map_number else "no keyframe shows what it shows: it begins a new map"
         return self._result(first, reason=reason if frame.textured else "no floor texture")
 
     def _placed(self, placed: TrackedFrame, links: list[Link]) -> list[TrackingResult]:
         """A frame that keyframes show; where it has links and shows anything new, it is the next keyframe."""
-        self._map.state = self._map.state.placed()
+        self._map.lost_frames = 0
         inliers, last = int(placed.place.inliers.sum()), self._map.keyframes[-1].number
         shown = next((link for link in links if link.image1 == last), None)
         between = shown is not None and not self._is_new(placed)
@@ -162,18 +159,17 @@ class FrameTracker:
         """A frame placed by odometry, as the next keyframe where it shows anything new."""
         revised = list[TrackingResult]()
         if placed.frame.textured and self._is_new(placed):
-            self._map.state = self._map.state.placed()
+            self._map.lost_frames = 0
             revised = self._add_keyframe(placed, [])
         return [*revised, self._result(placed)]
 
     def _without_place(self, frame: Frame) -> TrackingResult:
         """A frame that no keyframe shows; after many of them, a new map begins with the last."""
-        self._map.state = self._map.state.unplaced()
+        self._map.lost_frames += 1
         if not frame.textured:
             return self._unplaced(frame, "no floor texture")
-        state = self._map.state.next_map(len(self._map.keyframes), all_searched=self._map.all_searched)
-        if state is not None:
-            return self._first(frame, state)
+        if (map_number := self._map.next_number) is not None:
+            return self._first(frame, map_number)
         return self._unplaced(frame, "no keyframe shows what it shows")
 
     def _is_new(self, placed: TrackedFrame) -> bool:
@@ -184,26 +180,23 @@ class FrameTracker:
         """Keep the frame; take over an alignment of the last keyframes, which may place others, and begin the next."""
         self._flow.begin(placed.frame.image, placed.frame.corners)
         self._map.add(placed, links)
-        if self._map.state.initialising:
+        if not self._map.has_plane:
             self._knowledge.vote(self._map.links)
         revised = self._with_checked_camera(placed)
         if placed.frame.body is not None:
             self._odometry.learn(self._map.by_number.values())
-        if self._refinement.is_waited_for(self._map.seen):
+        if self._refinement.is_waited_for(self._map.added):
             revised += self._take_over(placed, None)
         self._refinement.begin_if_due(self._map)
         return revised
 
     def _with_checked_camera(self, latest: TrackedFrame) -> list[TrackingResult]:
         """Earlier frames whose places are others, or surer, by what keyframes show of a camera that was given."""
-        revision = check_camera(self._map, latest.frame)
-        if revision is None:
-            return []
+        focal, revision = self._knowledge.focal, revise_camera(self._map, latest.frame)
         for message in revision.messages:
             self._report(message)
-        if revision.focal != self._knowledge.focal:
+        if self._knowledge.focal != focal:
             self._refinement.drop()
-        self._knowledge.revise(revision)
         if revision.length_factor is not None:
             self._map.rescale(revision.length_factor)
         elif not revision.report_again:
@@ -225,10 +218,13 @@ class FrameTracker:
     def _result(
         self, placed: TrackedFrame, inliers: int = 0, *, reason: str = "", revised: bool = False
     ) -> TrackingResult:
-        place, pose, keyframes = placed.place, placed.place.pose, len(self._map.keyframes)
-        if not place.aligned:
-            reason = reason or self._map.state.why_waiting(keyframes, is_keyframe=placed.keyframe)
-        elif pose is None:
+        place, pose = placed.place, placed.place.pose
+        if not place.aligned and not reason:
+            moved = len(self._map.keyframes) > 1 or placed.keyframe
+            reason = "the first keyframes are being aligned" if moved else "the camera has not moved far enough yet"
+            if self._map.has_plane:
+                reason = "it is not linked with the map yet"
+        elif place.aligned and pose is None:
             reason = "the model has no metric poses"
         return replace(
             self._unplaced(placed.frame, reason),
@@ -248,7 +244,7 @@ class FrameTracker:
             distortion=knowledge.distortion,
             distortion_std=knowledge.distortion_std,
             distortion_known=knowledge.distortion_known,
-            map_number=self._map.state.map_number,
+            map_number=self._map.number,
             length_std=knowledge.length_std,
             unit=unit,
             unit_std=unit_std,

@@ -12,7 +12,7 @@ from rdstitch.matching.two_view import Pair
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import NO_CACHE, Cache
 from rdstitch.verification.limits import Limits
-from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps, share_alike
+from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,11 @@ class ResultEvidence:
         """The links that the alignment uses."""
         return [fit for fit in self.alignment.links if fit.used]
 
+    @property
+    def worst(self) -> LinkFit:
+        """The link with the largest errors."""
+        return max(self.used, key=lambda fit: fit.rms)
+
     @cached_property
     def _images(self) -> ComparedImages:
         return ComparedImages(self.registration.sources, self.registration.stretch, self.threads)
@@ -58,20 +63,20 @@ class ResultEvidence:
         """Pairs of a repeated pattern, of which nobody can say by how many periods they are apart."""
         return {link.pair: link for link in self.checked if link.ambiguity.ambiguous and not link.unique}
 
-    def looks_right(self, images: Sequence[int]) -> bool:
-        """Whether what an image, or a pair, or all of them if empty, has in common with others is clearly alike."""
-        links = [link for link in self.checked if len({*images} & {*link.pair}) == len(images)]
-        cells = sum(link.agreement.cells for link in links)
-        return cells >= Limits.min_cells.value and share_alike(links) >= Limits.min_alike_fraction.value
-
     def explained_by_depth(self, images: Sequence[int]) -> bool:
-        """Whether matches of a picture disagree where its images look alike: it has depth, or something moved."""
-        return self.purpose.picture and self.looks_right(images)
+        """Whether matches of an image, of a pair, or of all if empty, disagree where a picture is more alike than by
+        chance: it has depth, or something moved.
+        """
+        if not self.purpose.picture:
+            return False
+        overlaps = [link.agreement for link in self.checked if len({*images} & {*link.pair}) == len(images)]
+        cells, confirming = sum(each.cells for each in overlaps), sum(each.confirming for each in overlaps)
+        return cells >= Limits.min_cells and confirming >= Limits.max_unlike_fraction * cells
 
     @cached_property
     def alike_fraction(self) -> float:
         """How much alike images look where most pairs put them, [0, 1]; 0 where there is nothing to see."""
-        shares = [link.agreement.share for link in self.checked if link.agreement.cells >= Limits.min_cells.value]
+        shares = [link.agreement.share for link in self.checked if link.agreement.cells >= Limits.min_cells]
         return float(np.median(shares)) if shares else 0.0
 
     @property

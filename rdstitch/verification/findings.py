@@ -1,9 +1,9 @@
 """What the rules find: data that repairs are made from, and the one place where they become sentences."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, TypedDict
+from typing import Any
 
 from rdstitch.results.messages import MAX_NAMED, Message, Severity, names_of, shortened
 from rdstitch.results.registration import Registration
@@ -91,33 +91,6 @@ class Kind(Enum):
         self.scope, self.code, self.text = scope, code, text
 
 
-class Measured(TypedDict, total=False):
-    """What a rule measured, of which each kind's sentence names some: images by their indices."""
-
-    inliers: int
-    count: int
-    of: int
-    sampled: int
-    confirming: int
-    cells: int
-    rms: float  # rms, threshold: pixels
-    threshold: float
-    share: float
-    shift: float  # share of an image
-    ratio: float
-    reason: str
-    what: str
-    lens1: float  # lens1, lens2: λ
-    lens2: float
-    images1: list[int]
-    images2: list[int]
-    without: list[int]
-    near: int
-    far: int
-    bodies: dict[str, list[int]]
-    pairs: list[tuple[int, ...]]
-
-
 @dataclass(frozen=True)
 class Finding:
     """One thing that a rule found."""
@@ -125,7 +98,8 @@ class Finding:
     kind: Kind
     images: tuple[int, ...] = ()  # indices of the images that it concerns; empty where it concerns the whole
     severity: Severity = "failure"  # as of :class:`rdstitch.results.messages.Message`
-    values: Measured = field(default_factory=Measured)
+    # what the rule measured, of which the kind's sentence names some: images by their indices
+    values: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def fails(self) -> bool:
@@ -140,7 +114,7 @@ def messages_of(findings: Iterable[Finding], registration: Registration) -> list
 
 
 def _message(finding: Finding, paths: Sequence[str]) -> Message:
-    images, values = tuple(paths[k] for k in finding.images), dict[str, Any](finding.values)
+    images, values = tuple(paths[k] for k in finding.images), dict(finding.values)
     names = names_of(images)
     if "pairs" in values:
         pairs = values.pop("pairs")

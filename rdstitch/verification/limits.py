@@ -1,14 +1,19 @@
 """The thresholds that results are judged by, with units and what set each: a measurement, or "unmeasured"."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 
-class Limit(NamedTuple):
-    """A threshold."""
+@dataclass(frozen=True)
+class Limit:
+    """A threshold; as an attribute of a class its value."""
 
     value: float
     unit: str
     source: str
+
+    def __get__(self, instance: object, owner: type) -> float:
+        """The value."""
+        return self.value
 
 
 class Limits:
@@ -49,5 +54,10 @@ class Limits:
     # Second motions.
     min_motion_inliers = Limit(12, "matches", "four define it; eight more by chance have not been seen")
     min_plane_fraction = Limit(0.5, "fraction", "by definition: what fills less of the images is in front of it")
+    # Layouts.
+    max_magnification = Limit(4.0, "ratio to the median place", "a plane seen 60 degrees off its normal")
+    max_aspect = Limit(2.0, "ratio of both directions", "a plane seen 60 degrees off its normal")
+    visible_cut = Limit(0.02, "fraction of the images", "unmeasured: of more that is cut away a note says so")
+    max_straightening_cut = Limit(0.1, "fraction of the images", "unmeasured")
     # Inputs.
     max_focal_ratio = Limit(1.03, "ratio", "EXIF rounds focal lengths to about one per cent")

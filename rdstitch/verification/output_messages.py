@@ -10,8 +10,7 @@ from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.results.messages import MAX_NAMED, Message, names_of, shortened
 from rdstitch.results.placed_images import PlacedImages
-
-_VISIBLE_CUT = 0.02  # share of the images that is cut away, from which on a note says so
+from rdstitch.verification.limits import Limits
 
 
 def masked_messages(placed: PlacedImages) -> list[Message]:
@@ -31,7 +30,7 @@ def cut_away_messages(placed: PlacedImages, canvas: Canvas, options: CompositeOp
     text = f"{share:.0%} of what the images show is cut away: it would be stretched over {options.max_stretch:g} times"
     if placed.turned and canvas.projection == PLANE:
         text += "; --projection cylinder or sphere shows more"
-    return [Message(text, severity="note")] if share > _VISIBLE_CUT else []
+    return [Message(text, severity="note")] if share > Limits.visible_cut else []
 
 
 def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:

@@ -153,7 +153,7 @@ def _cells(image: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
 
 def _have_texture(cells: Grey) -> NDArray[np.bool_]:
     """Which cells (N, h, w) are distinctive; not those with transparent pixels, whose deviation is NaN."""
-    return np.asarray(cells.std(axis=(1, 2)) > Limits.min_texture.value)
+    return np.asarray(cells.std(axis=(1, 2)) > Limits.min_texture)
 
 
 def _confirms(cell: Grey, window: Grey) -> bool:
@@ -161,6 +161,6 @@ def _confirms(cell: Grey, window: Grey) -> bool:
     scores = np.asarray(cv2.matchTemplate(window, cell, cv2.TM_CCOEFF_NORMED))
     row, column = np.unravel_index(int(scores.argmax()), scores.shape)
     return bool(
-        scores[row, column] >= Limits.min_correlation.value
-        and np.hypot(row - _SEARCH_RADIUS, column - _SEARCH_RADIUS) <= Limits.max_offset.value
+        scores[row, column] >= Limits.min_correlation
+        and np.hypot(row - _SEARCH_RADIUS, column - _SEARCH_RADIUS) <= Limits.max_offset
     )

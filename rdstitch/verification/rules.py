@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from rdstitch.alignment.result import LinkFit, links_by_image
-from rdstitch.alignment.unaligned import few_features
+from rdstitch.alignment.sentences import few_features
 from rdstitch.choices import Purpose
 from rdstitch.inputs.source import Source
 from rdstitch.results.messages import Severity
 from rdstitch.verification.evidence import ResultEvidence
-from rdstitch.verification.findings import Finding, Kind, Measured
+from rdstitch.verification.findings import Finding, Kind
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.overlap_check import wrong_at_most
 from rdstitch.verification.second_motions import fills_at_most
@@ -23,7 +23,7 @@ from rdstitch.verification.second_motions import fills_at_most
 def _disagreeing_pairs(evidence: ResultEvidence) -> Iterator[Finding]:
     """Pairs of whose matches most do not fit into the whole."""
     for fit in evidence.used:
-        few = fit.inliers < Limits.min_pair_inlier_fraction.value * fit.count
+        few = fit.inliers < Limits.min_pair_inlier_fraction * fit.count
         if few and not evidence.explained_by_depth(fit.images):
             reason = _reason(evidence, fit.images, [fit], "stitch them on their own")
             yield Finding(Kind.PAIR_MISFITS, fit.images, values={**_counts([fit]), "reason": reason})
@@ -32,21 +32,21 @@ def _disagreeing_pairs(evidence: ResultEvidence) -> Iterator[Finding]:
 def _misfitting_images(evidence: ResultEvidence) -> Iterator[Finding]:
     """Images of whose matches too many do not fit into the whole, over all pairs that do."""
     for k, links in sorted(links_by_image(evidence.used).items()):
-        fits = [fit for fit in links if fit.inliers >= Limits.min_pair_inlier_fraction.value * fit.count]
+        fits = [fit for fit in links if fit.inliers >= Limits.min_pair_inlier_fraction * fit.count]
         counts = _counts(fits)
-        few = counts["inliers"] < Limits.min_image_inlier_fraction.value * counts["count"]
+        few = counts["inliers"] < Limits.min_image_inlier_fraction * counts["count"]
         if few and not evidence.explained_by_depth((k,)):
             yield Finding(Kind.IMAGE_MISFITS, (k,), values={**counts, "reason": _reason(evidence, (k,), fits)})
 
 
 def _matches_disagree(evidence: ResultEvidence) -> Iterator[Finding]:
     counts = _counts(evidence.used)
-    few = counts["inliers"] < Limits.min_pair_inlier_fraction.value * counts["count"]
+    few = counts["inliers"] < Limits.min_pair_inlier_fraction * counts["count"]
     if few and not evidence.explained_by_depth(()):
         yield Finding(Kind.MATCHES_DISAGREE, values=counts)
 
 
-def _counts(fits: Sequence[LinkFit]) -> Measured:
+def _counts(fits: Sequence[LinkFit]) -> dict[str, int]:
     return {"inliers": sum(fit.inliers for fit in fits), "count": sum(fit.count for fit in fits)}
 
 
@@ -56,7 +56,7 @@ def _reason(evidence: ResultEvidence, images: Sequence[int], fits: Sequence[Link
     if any(why for _, why in few):
         return ", ".join(f"{name} has {why}" for name, why in few if why)
     why = "they fit each other: does it show another surface, or come from another camera or zoom?"
-    if sum(fit.count for fit in fits) < Limits.few_matches.value:
+    if sum(fit.count for fit in fits) < Limits.few_matches:
         why = "too few to place it: little overlap, or none?"
     return f"{why} {remedy}".strip()
 
@@ -67,7 +67,7 @@ def _mixed_lenses(evidence: ResultEvidence) -> Iterator[Finding]:
     if mixed is not None and not mixed.certain:
         images1, images2 = ([k for k, other in enumerate(mixed.second) if other == which] for which in (False, True))
         lens1, lens2 = mixed.distortion
-        values: Measured = {"images1": images1, "images2": images2, "lens1": lens1, "lens2": lens2}
+        values = {"images1": images1, "images2": images2, "lens1": lens1, "lens2": lens2}
         yield Finding(Kind.LENSES_MIXED, values=values)
 
 
@@ -75,19 +75,19 @@ def _errors(evidence: ResultEvidence) -> Iterator[Finding]:
     """Errors of all pairs together; of a picture its seams say whether they are seen."""
     alignment, threshold = evidence.alignment, evidence.threshold
     rms, relief = alignment.rms, alignment.relief
-    if rms <= Limits.max_rms.value * threshold:
+    if rms <= Limits.max_rms * threshold:
         return
-    largest = Limits.max_relief_rms.value * 2.0 * max(camera.scale for camera in alignment.cameras)
+    largest = Limits.max_relief_rms * 2.0 * max(camera.scale for camera in alignment.cameras)
     # Without what neighbours have in common, errors are those of a plane.
-    explained = rms <= largest and rms**2 - relief.size**2 <= (Limits.max_rms.value * threshold) ** 2
+    explained = rms <= largest and rms**2 - relief.size**2 <= (Limits.max_rms * threshold) ** 2
     # Where the pixels agree, depth that one surface does not explain has been found a place all the same.
-    rough = (
-        rms <= Limits.max_rough_rms.value * threshold and evidence.alike_fraction >= Limits.min_alike_fraction.value
-    ) or (relief.found and explained and evidence.alike_fraction >= Limits.min_clearly_alike_fraction.value)
-    values: Measured = {"rms": rms, "threshold": threshold}
+    rough = (rms <= Limits.max_rough_rms * threshold and evidence.alike_fraction >= Limits.min_alike_fraction) or (
+        relief.found and explained and evidence.alike_fraction >= Limits.min_clearly_alike_fraction
+    )
+    values = {"rms": rms, "threshold": threshold}
     if rough or evidence.purpose.picture:
         severity = _warning_if(evidence.flat or _depth_seen(evidence))
-        yield Finding(Kind.ROUGH, max(evidence.used, key=lambda fit: fit.rms).images, severity, values)
+        yield Finding(Kind.ROUGH, evidence.worst.images, severity, values)
     else:
         yield Finding(Kind.ERRORS, values=values)
 
@@ -96,17 +96,16 @@ def _depth(evidence: ResultEvidence) -> Iterator[Finding]:
     """Errors that neighbouring matches have in common, and where they are largest."""
     relief = evidence.alignment.relief
     if relief.found:
-        fit = max(evidence.used, key=lambda fit: fit.rms)
-        kind = Kind.DEPTH_OF_A_TURN if evidence.alignment.on_sphere else Kind.RELIEF
+        fit, kind = evidence.worst, (Kind.DEPTH_OF_A_TURN if evidence.alignment.on_sphere else Kind.RELIEF)
         # Even where seams hold a bent plane adds up from image to image, and tilts take most of it up.
-        bent = not evidence.purpose.picture or relief.size > Limits.max_shared_error.value * evidence.threshold
+        bent = not evidence.purpose.picture or relief.size > Limits.max_shared_error * evidence.threshold
         severity = _warning_if((evidence.flat and bent) or _depth_seen(evidence))
         yield Finding(kind, fit.images, severity, {"what": relief.explanation, "rms": fit.rms})
 
 
 def _depth_seen(evidence: ResultEvidence) -> bool:
     """Whether depth leaves the images unlike; pictures have their seams."""
-    return not evidence.purpose.picture and evidence.alike_fraction < Limits.min_alike_fraction.value
+    return not evidence.purpose.picture and evidence.alike_fraction < Limits.min_alike_fraction
 
 
 def _warning_if(warns: bool) -> Severity:
@@ -117,8 +116,7 @@ def _free_homographies(evidence: ResultEvidence) -> Iterator[Finding]:
     """A homography for each of three or more images: their chain bends with whatever is not modelled."""
     alignment = evidence.alignment
     if evidence.flat and alignment.focal is None:
-        fit = max(evidence.used, key=lambda fit: fit.rms)
-        yield Finding(Kind.FREE_HOMOGRAPHIES, fit.images, _warning_if(alignment.relief.found))
+        yield Finding(Kind.FREE_HOMOGRAPHIES, evidence.worst.images, _warning_if(alignment.relief.found))
 
 
 def _unlike(evidence: ResultEvidence) -> Iterator[Finding]:
@@ -126,22 +124,22 @@ def _unlike(evidence: ResultEvidence) -> Iterator[Finding]:
     as depth shifts what it shows by a little nearly everywhere.
     """
     for link in evidence.checked:
-        coarsely = evidence.purpose.picture and link.agreement.coarsely >= Limits.min_plane_fraction.value
+        coarsely = evidence.purpose.picture and link.agreement.coarsely >= Limits.min_plane_fraction
         if (
-            link.agreement.cells >= Limits.min_cells.value
-            and link.agreement.share < Limits.max_unlike_fraction.value
+            link.agreement.cells >= Limits.min_cells
+            and link.agreement.share < Limits.max_unlike_fraction
             and not coarsely
         ):
-            values: Measured = {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
+            values = {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
             yield Finding(Kind.UNLIKE, link.pair, "failure", values)
 
 
 def _compared_overlaps(evidence: ResultEvidence) -> Iterator[Finding]:
     """How many of many overlaps were compared in their pixels, and what that says of the others."""
     checked, share = evidence.checked, wrong_at_most(evidence.checked)
-    if share < Limits.max_wrong_overlaps.value:
+    if share < Limits.max_wrong_overlaps:
         sampled = sum(link.sampled for link in checked)
-        values: Measured = {"of": len(evidence.used), "count": len(checked), "sampled": sampled, "share": share}
+        values = {"of": len(evidence.used), "count": len(checked), "sampled": sampled, "share": share}
         yield Finding(Kind.LOOKED_AT, (), "detail", values)
 
 
@@ -152,7 +150,7 @@ def _ambiguous(evidence: ResultEvidence) -> Iterator[Finding]:
 
 def _pattern(evidence: ResultEvidence) -> Iterator[Finding]:
     """A pattern over so many pairs that leaving some of them out proves nothing; or one in which the unique decided."""
-    if len(evidence.ambiguous) > Limits.max_ambiguous_pairs.value * len(evidence.checked):
+    if len(evidence.ambiguous) > Limits.max_ambiguous_pairs * len(evidence.checked):
         yield Finding(Kind.PATTERN, values={"count": len(evidence.ambiguous), "of": len(evidence.checked)})
     settled = [link for link in evidence.checked if link.unique]
     if settled:
@@ -162,7 +160,7 @@ def _pattern(evidence: ResultEvidence) -> Iterator[Finding]:
 def _rival_motion(evidence: ResultEvidence) -> Iterator[Finding]:
     """Poses by something that fills less than half of the images: what drives ahead, say."""
     share = fills_at_most(link.agreement for link in evidence.checked)
-    if share < Limits.min_plane_fraction.value:
+    if share < Limits.min_plane_fraction:
         yield Finding(Kind.RIVAL_MOTION, values={"share": share})
 
 
@@ -184,7 +182,7 @@ def _inputs(evidence: ResultEvidence) -> Iterator[Finding]:
     focal = {k: _focal_share(source) for k, source in enumerate(sources) if source.metadata.focal_px is not None}
     if len(bodies) > 1:
         yield Finding(Kind.SEVERAL_CAMERAS, (), "warning", {"bodies": bodies})
-    elif focal and max(focal.values()) > Limits.max_focal_ratio.value * min(focal.values()):
+    elif focal and max(focal.values()) > Limits.max_focal_ratio * min(focal.values()):
         near, far = min(focal, key=lambda k: focal[k]), max(focal, key=lambda k: focal[k])
         yield Finding(Kind.ZOOMED, (), "warning", {"ratio": focal[far] / focal[near], "near": near, "far": far})
     without = [k for k, source in enumerate(sources) if source.mask is None]

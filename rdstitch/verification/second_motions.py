@@ -7,7 +7,6 @@ part only, and may fill all that is not seen there.
 """
 
 import math
-from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -17,10 +16,10 @@ import numpy as np
 from rdstitch.executors import batches
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
-from rdstitch.matching.match_graph import connected_components
 from rdstitch.matching.two_view import PAIRS_ESTIMATED_AT_ONCE, Pair, PairRegistration
 from rdstitch.results.registration import Registration
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
+from rdstitch.system.late_imports import csgraph, sparse
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.photometric_agreement import Agreement, overlap_agreement
@@ -44,7 +43,7 @@ def planes_of_pairs(registration: Registration, threshold: float, threads: int =
         with ThreadPoolExecutor(threads) as pool:
             return dict(zip(motions, pool.map(fills, motions, motions.values()), strict=True))
 
-    half = Limits.min_plane_fraction.value
+    half = Limits.min_plane_fraction
     found = filled_by({pair.images: pair.relation for pair in pairs})
     if all(share >= half for share, _ in found.values()):
         return None
@@ -61,15 +60,11 @@ def planes_of_pairs(registration: Registration, threshold: float, threads: int =
 
 def _least_needed(fills: Mapping[Pair, float]) -> float:
     """The share from which on pairs join all images that all of them join: those of less may show anything."""
-    surest = sorted(fills, key=lambda pair: -fills[pair])
-    if not surest:
+    if not fills:
         return math.inf
-    images = 1 + max(map(max, surest))
-
-    def parts(count: int) -> int:
-        return len(connected_components(images, *zip(*surest[:count], strict=True)))
-
-    return fills[surest[bisect_left(range(1, len(surest)), -parts(len(surest)), key=lambda count: -parts(count))]]
+    first, second = np.array(list(fills)).T
+    graph = sparse.coo_array((-np.array(list(fills.values())), (first, second)), (max(map(max, fills)) + 1,) * 2)
+    return -float(csgraph.minimum_spanning_tree(graph.tocsr()).data.max())
 
 
 def second_motions(
@@ -80,7 +75,7 @@ def second_motions(
     """
     result = {}
     rests = {pair.images: np.flatnonzero(~pair.relation.inliers) for pair in pairs}
-    enough = [pair for pair in pairs if len(rests[pair.images]) >= Limits.min_motion_inliers.value]
+    enough = [pair for pair in pairs if len(rests[pair.images]) >= Limits.min_motion_inliers]
     for batch in batches(enough, PAIRS_ESTIMATED_AT_ONCE):
         given = []
         for pair in batch:
@@ -90,7 +85,7 @@ def second_motions(
             given.append(PairMatches(matches.points1, matches.points2, camera, other, -matches.ratio))
         motions = estimate_radial_homographies(given, EstimationOptions(threshold=threshold))
         for pair, motion in zip(batch, motions, strict=True):
-            if motion and int(motion.inliers.sum()) >= Limits.min_motion_inliers.value:
+            if motion and int(motion.inliers.sum()) >= Limits.min_motion_inliers:
                 inliers = np.zeros(len(pair.matches), dtype=np.bool_)
                 inliers[rests[pair.images][motion.inliers]] = True
                 result[pair.images] = replace(motion, inliers=inliers)

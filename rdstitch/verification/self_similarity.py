@@ -42,10 +42,8 @@ class Ambiguity:
     def ambiguous(self) -> bool:
         """Whether the images fit elsewhere as well as here."""
         left, left_elsewhere = max(1.0 - self.here**2, _NOISE), 1.0 - self.elsewhere**2
-        as_well = self.elsewhere > max(
-            Limits.min_correlation.value, Limits.ambiguous_correlation_ratio.value * self.here
-        )
-        return as_well and left_elsewhere < Limits.ambiguous_residual_ratio.value * left
+        as_well = self.elsewhere > max(Limits.min_correlation, Limits.ambiguous_correlation_ratio * self.here)
+        return as_well and left_elsewhere < Limits.ambiguous_residual_ratio * left
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +103,7 @@ def placement_ambiguity(first: Drawing, second: Drawing, longest_side: int = MAX
     score = overlaps.correlation()
     # A peak of its own, not the flank of the one here.
     peak = score >= cv2.dilate(score, np.ones((2 * math.ceil(share * SLACK) + 1,) * 2, dtype=np.uint8))
-    enough = overlaps.area >= Limits.min_kept_overlap.value * most
+    enough = overlaps.area >= Limits.min_kept_overlap * most
     other = np.where(peak & (distance > share * _MIN_SHIFT) & enough, score, np.float32(0.0))
     best = int(other.argmax())
     elsewhere = float(other.flat[best]) and _between_pixels(score, *np.unravel_index(best, score.shape))

@@ -43,8 +43,8 @@ class UniqueShift:
     @property
     def decides(self) -> bool:
         """Whether the images lie here and nowhere else."""
-        clear = self.matched >= max(Limits.min_matched_departures.value, Limits.min_lead.value * self.matched_elsewhere)
-        return clear and self.share >= Limits.min_departure_correlation.value
+        clear = self.matched >= max(Limits.min_matched_departures, Limits.min_lead * self.matched_elsewhere)
+        return clear and self.share >= Limits.min_departure_correlation
 
 
 def unique_shifts(
@@ -89,7 +89,7 @@ def departures(pixels: Grey) -> Grey | None:
     peaks = _peaks(Overlaps.of(pixels, pixels), pixels, np.zeros(2), _OWN_OVERLAP)
     periods = peaks.shift[np.hypot(*peaks.shift.T) > _MIN_SHIFT]
     periods = periods[np.argsort(np.hypot(*periods.T), kind="stable")][:_MAX_PERIODS]
-    if len(periods) < Limits.min_periods.value:
+    if len(periods) < Limits.min_periods:
         return None
     copies = np.stack([_shifted(pixels, shift) for shift in periods])
     count = np.isfinite(copies).sum(axis=0)
@@ -104,7 +104,7 @@ def departures(pixels: Grey) -> Grey | None:
         for values in (pixels - middle, spread)
     )
     relative = departure / np.maximum(usual, max(float(np.median(usual[known])), 1e-6))
-    size = np.clip(np.abs(relative) - Limits.min_departure.value, 0.0, _MOST)
+    size = np.clip(np.abs(relative) - Limits.min_departure, 0.0, _MOST)
     return np.where(known & (inside > 0), np.copysign(size, relative), np.float32(np.nan)).astype(np.float32)
 
 
@@ -142,7 +142,7 @@ def _peaks(overlaps: Overlaps, first: Grey, offset: FloatArray, least_overlap: f
     score = overlaps.correlation()
     kernel = np.ones((2 * _MIN_SHIFT + 1, 2 * _MIN_SHIFT + 1), dtype=np.uint8)
     enough = overlaps.area >= least_overlap * overlaps.area.max()
-    peak = (score >= cv2.dilate(score, kernel)) & enough & (score > Limits.min_period_correlation.value)
+    peak = (score >= cv2.dilate(score, kernel)) & enough & (score > Limits.min_period_correlation)
     peak[[0, -1]] = peak[:, [0, -1]] = False
     row, column = np.nonzero(peak)
     x, y = (

@@ -1,13 +1,12 @@
 """Small rendered images, and the command line run in this process."""
 
-import shutil
 from pathlib import Path
 
 import pytest
 from rdstitch_cli.main import run
 
 from rdstitch.synthetic import Sequence
-from tests.cli.running import CACHED, Outcome, Run, check_sidecar, flight
+from tests.cli.running import CACHED, Outcome, Run, check_sidecar, copied, flight
 
 
 @pytest.fixture(scope="session")
@@ -40,18 +39,15 @@ def stitched(frames: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Pa
 @pytest.fixture
 def place(tmp_path: Path, frames: list[Path]) -> Path:
     """A folder with two good images, ``a.png`` and ``b.png``."""
-    for name, frame in zip("ab", frames[:2], strict=True):
-        shutil.copy(frame, tmp_path / f"{name}.png")
+    copied(frames, tmp_path, "a.png", "b.png")
     return tmp_path
 
 
 @pytest.fixture
 def here(place: Path, frames: list[Path], stranger: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The current folder: two good images ``a.png`` and ``b.png``; in ``more`` two again; and one of other ground."""
-    (place / "more").mkdir()
-    for frame in frames[:2]:
-        shutil.copy(frame, place / "more")
-    shutil.copy(stranger, place / "stranger.png")
+    copied(frames[:2], place / "more")
+    copied([stranger], place, "stranger.png")
     monkeypatch.chdir(place)
     return place
 

@@ -4,10 +4,11 @@ import csv
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -97,7 +98,10 @@ def flight(seed: int, columns: int, rows: int = 1, distortion: float = DISTORTIO
 
 
 def start(
-    *arguments: str | Path, stdin: int = subprocess.DEVNULL, program: str = _PROGRAM
+    *arguments: str | Path,
+    stdin: int = subprocess.DEVNULL,
+    program: str = _PROGRAM,
+    environment: Mapping[str, str] | None = None,
 ) -> "subprocess.Popen[bytes]":
     """Start the command line as a process of its own."""
     return subprocess.Popen(
@@ -105,7 +109,7 @@ def start(
         stdin=stdin,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        env={**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})},
     )
 
 
@@ -126,6 +130,13 @@ def state_of(folder: Path) -> dict[str, bytes | None]:
         os.fsencode(path.relative_to(folder)).decode("latin-1"): path.read_bytes() if path.is_file() else None
         for path in folder.rglob("*")
     }
+
+
+def copied(files: Iterable[Path], folder: Path, *names: str) -> list[Path]:
+    """Copies under these names, or their own, in a folder that is made where it is missing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    named = zip(files, names, strict=False) if names else ((file, file.name) for file in files)
+    return [Path(shutil.copy(file, folder / name)) for file, name in named]
 
 
 def shown(path: Path) -> str:

@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
 import sys
 import unicodedata
 from pathlib import Path
@@ -19,7 +18,7 @@ from rdstitch.errors import InputError
 from rdstitch.io import read_image
 from rdstitch.io.metadata import read_metadata
 from rdstitch.sidecar.read import read_sidecar
-from tests.cli.running import CACHED, OPTIONS, Outcome, Run, sidecar_of
+from tests.cli.running import CACHED, OPTIONS, Outcome, Run, copied, finished, sidecar_of, start
 
 
 def _sidecar(image: Path) -> Path:
@@ -183,9 +182,7 @@ def test_equal_names_of_another_flight_are_refused_and_other_images_named(
 
 def test_a_missing_image_is_named(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
     folder = tmp_path / "some"
-    folder.mkdir()
-    for frame in frames[:2]:
-        shutil.copy(frame, folder)
+    copied(frames[:2], folder)
     _apply(rdstitch, _sidecar(stitched), folder, tmp_path / "some.tif", told=frames[2].name)
     assert [image["used"] for image in sidecar_of(tmp_path / "some.tif")["images"]] == [True, True, False]
     _apply(rdstitch, _sidecar(stitched), folder, tmp_path / "strict.tif", "--strict", status=5)
@@ -195,8 +192,7 @@ def test_a_missing_image_is_named(rdstitch: Run, frames: list[Path], stitched: P
 def test_images_of_one_name_in_two_folders(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     folders = [tmp_path / name for name in ("cam0", "cam1")]
     for folder, frame in zip(folders, frames, strict=False):
-        folder.mkdir()
-        shutil.copy(frame, folder / "x.png")
+        copied([frame], folder, "x.png")
     output, layers = tmp_path / "out.png", tmp_path / "layers"
     rdstitch("mosaic", *folders, "-o", output, "--layers", layers, *CACHED)
     assert [image["name"] for image in sidecar_of(output)["images"]] == ["cam0/x.png", "cam1/x.png"]
@@ -221,8 +217,7 @@ def test_layers_are_called_as_was_checked(rdstitch: Run, place: Path) -> None:
 
 
 def test_layers_whose_masks_would_be_called_like_another(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
-    for name, frame in zip(("a.png", "a_mask.png"), frames, strict=False):
-        shutil.copy(frame, tmp_path / name)
+    copied(frames, tmp_path, "a.png", "a_mask.png")
     layers = tmp_path / "layers"
     rdstitch("mosaic", tmp_path, "-o", tmp_path / "out.jpg", "--layers", layers, *CACHED)
     assert {file.name for file in layers.iterdir()} == {
@@ -250,8 +245,7 @@ def test_what_does_not_fit_is_refused(rdstitch: Run, frames: list[Path], stitche
 
 
 def test_never_writes_over_its_sidecar(rdstitch: Run, frames: list[Path], stitched: Path, tmp_path: Path) -> None:
-    for file in (stitched, _sidecar(stitched)):
-        shutil.copy(file, tmp_path)
+    copied([stitched, _sidecar(stitched)], tmp_path)
     own = tmp_path / stitched.name
     _apply(rdstitch, _sidecar(own), frames[0].parent, own, "--overwrite", status=6, told=str(own))
     assert _sidecar(own).read_bytes() == _sidecar(stitched).read_bytes()
@@ -267,13 +261,6 @@ _LATIN = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONI
 _UTF8 = {"LC_ALL": "C", "PYTHONUTF8": "1"}
 
 
-def _run(locale: dict[str, str], *arguments: str) -> str:
-    command = [sys.executable, "-m", "rdstitch_cli", *arguments]
-    done = subprocess.run(command, capture_output=True, env={**os.environ, **locale}, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stderr.decode("latin-1")
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="names of files are bytes")
 @pytest.mark.parametrize(("written", "composed"), [(_LATIN, "NFD"), (_UTF8, "NFC")], ids=["ascii", "utf-8"])
 def test_names_match_whatever_the_locale(
@@ -282,15 +269,14 @@ def test_names_match_whatever_the_locale(
     names = [f"gr\u00fcn_{k}.png" for k in range(3)]
     forms: list[tuple[str, Literal["NFC", "NFD"]]] = [("a", "NFC"), ("b", composed)]
     for folder, form in forms:
-        (tmp_path / folder).mkdir()
-        for frame, name in zip(frames, names, strict=True):
-            data = unicodedata.normalize(form, name).encode()
-            shutil.copy(frame, tmp_path / folder / os.fsdecode(data))
+        copied(frames, tmp_path / folder, *(os.fsdecode(unicodedata.normalize(form, name).encode()) for name in names))
     read = _UTF8 if written is _LATIN else _LATIN
     options = ("--max-features", "600", "-j", "1")
-    _run(written, "mosaic", str(tmp_path / "a"), "-o", str(tmp_path / "out.tif"), *options)
-    said = _run(read, "apply", f"{tmp_path}/out.tif.json", "--images", str(tmp_path / "b"), "-o", f"{tmp_path}/new.tif")
-    assert "taken in order" not in said
+    made = start("mosaic", tmp_path / "a", "-o", tmp_path / "out.tif", *options, environment=written)
+    assert finished(made).status == 0
+    images = ("--images", tmp_path / "b", "-o", tmp_path / "new.tif")
+    said = finished(start("apply", tmp_path / "out.tif.json", *images, environment=read))
+    assert (said.status, "taken in order" in said.err) == (0, False)
     saved = sidecar_of(tmp_path / "new.tif")
     assert saved["applied"]["matched"] == "name"
     assert [image["name"] for image in saved["images"]] == names

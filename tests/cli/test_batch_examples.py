@@ -10,7 +10,7 @@ import pytest
 
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import read_image
-from tests.cli.running import FAST, Outcome
+from tests.cli.running import FAST, Outcome, copied
 from tests.sampled import sampled
 
 _SCRIPTS = Path(__file__).parents[2] / "examples" / "batch"
@@ -38,9 +38,7 @@ def environment(tmp_path: Path) -> dict[str, str]:
 def floors(tmp_path: Path, frames: list[Path]) -> Path:
     """Two folders of images, and one that is of no use; names with spaces and quotes."""
     for name, images in {"hall one": frames[:2], "it's two": frames[1:], "empty": []}.items():
-        (tmp_path / "floors" / name).mkdir(parents=True)
-        for image in images:
-            shutil.copy(image, tmp_path / "floors" / name)
+        copied(images, tmp_path / "floors" / name)
     return tmp_path / "floors"
 
 

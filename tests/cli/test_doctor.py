@@ -1,7 +1,6 @@
 """``rdstitch doctor``: what it says of sets with known faults."""
 
 import json
-import shutil
 from pathlib import Path
 
 import cv2
@@ -12,7 +11,7 @@ from PIL import ExifTags, Image
 from rdstitch.errors import LimitError
 from rdstitch.pipeline import doctor
 from rdstitch.pipeline.doctor import examine
-from tests.cli.running import Run
+from tests.cli.running import Run, copied
 
 
 def test_nothing_is_amiss(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
@@ -30,9 +29,8 @@ def test_nothing_is_amiss(rdstitch: Run, frames: list[Path], tmp_path: Path) -> 
 
 
 def test_faults_are_found(frames: list[Path], stranger: Path, tmp_path: Path) -> None:
-    for frame in frames:
-        shutil.copy(frame, tmp_path)
-    shutil.copy(stranger, tmp_path / "stranger.png")
+    copied(frames, tmp_path)
+    copied([stranger], tmp_path, "stranger.png")
     sharp = cv2.imread(str(frames[1]))
     cv2.imwrite(str(tmp_path / "blurred.png"), cv2.GaussianBlur(sharp, (0, 0), 3.0))
     cv2.imwrite(str(tmp_path / "burnt.png"), np.minimum(sharp * 3.0, 255).astype(np.uint8))

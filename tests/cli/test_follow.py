@@ -20,7 +20,7 @@ from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.follow import follow
-from tests.cli.running import DISTORTION, FAST, Run, flight, rows_of, start
+from tests.cli.running import DISTORTION, FAST, Run, copied, flight, rows_of, start
 from tests.sampled import sampled
 
 
@@ -33,8 +33,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Where the images arrive."""
-    made = tmp_path / "incoming"
-    made.mkdir()
+    (made := tmp_path / "incoming").mkdir()
     return made
 
 
@@ -86,8 +85,7 @@ def test_poses_at_once_and_then_the_same_image(rdstitch: Run, drive: list[Path],
 
 def test_an_interrupt_ends_with_what_has_arrived(drive: list[Path], folder: Path, tmp_path: Path) -> None:
     output = tmp_path / "path.csv"
-    for image in drive[:5]:
-        shutil.copy(image, folder)
+    copied(drive[:5], folder)
     process = start("trajectory", folder, "-o", output, "--follow", *FAST)
     names: set[str] = set()
     while len(names) < 5:
@@ -102,12 +100,10 @@ def test_an_interrupt_ends_with_what_has_arrived(drive: list[Path], folder: Path
 def test_a_reader_of_poses_that_ends_costs_no_frame(drive: list[Path], folder: Path, tmp_path: Path) -> None:
     output = tmp_path / "path.csv"
     process = start("trajectory", folder, "-o", output, "--follow", "--idle", "4", *FAST)
-    for image in drive[:3]:
-        shutil.copy(image, folder)
+    copied(drive[:3], folder)
     _line(process)
     process.stdout.close()
-    for image in drive[3:6]:
-        shutil.copy(image, folder)
+    copied(drive[3:6], folder)
     said = process.stderr.read().decode()
     process.stderr.close()
     assert process.wait() == 141
@@ -133,8 +129,7 @@ def test_names_on_standard_input_are_taken_as_they_come(drive: list[Path], tmp_p
 def test_lines_are_those_of_the_table(
     rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path, frame: str
 ) -> None:
-    for image in drive:
-        shutil.copy(image, folder)
+    copied(drive, folder)
     times = tmp_path / "times.csv"
     times.write_text("name,timestamp\n" + "".join(f"{p.name},{50 + k / 4}\n" for k, p in enumerate(drive)))
     output = tmp_path / "path.csv"
@@ -154,8 +149,7 @@ def test_lines_are_those_of_the_table(
 
 
 def test_the_line_of_what_cannot_be_read(rdstitch: Run, drive: list[Path], folder: Path, tmp_path: Path) -> None:
-    for image in drive[:3]:
-        shutil.copy(image, folder)
+    copied(drive[:3], folder)
     (folder / "frame_0001.png").write_bytes(b"no image")
     outcome = rdstitch("trajectory", folder, "-o", tmp_path / "path.csv", "--follow", "--idle", "0.1", *FAST)
     lines = [json.loads(line) for line in outcome.out.splitlines()]

@@ -1,6 +1,5 @@
 """``--mask``: what it excludes is neither matched nor shown."""
 
-import shutil
 from pathlib import Path
 
 import cv2
@@ -9,7 +8,7 @@ import pytest
 
 from examples.worlds.adverse_sets import adverse_set
 from rdstitch.io import read_image
-from tests.cli.running import CACHED, DISTORTION, Run, sidecar_of
+from tests.cli.running import CACHED, DISTORTION, Run, copied, sidecar_of
 
 LEG = (255, 0, 255)
 
@@ -44,10 +43,8 @@ def leg_pixels(output: Path) -> int:
 def test_a_leg_is_not_matched_nor_shown(rdstitch: Run, legs: Path, tmp_path: Path, command: str, *, one: bool) -> None:
     mask = tmp_path / "mask.png"
     if not one:
-        (tmp_path / "masks").mkdir()
-        for path in legs.iterdir():
-            shutil.copy(mask, tmp_path / "masks" / path.name)
-        mask = tmp_path / "masks"
+        names = [path.name for path in legs.iterdir()]
+        mask = copied([mask] * len(names), tmp_path / "masks", *names)[0].parent
     output = tmp_path / "out.png"
     done = rdstitch(command, *sorted(legs.iterdir()), "-o", output, "--mask", mask, *CACHED, err="")
     assert abs(float(done.out) - DISTORTION) < 0.01

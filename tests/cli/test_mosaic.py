@@ -15,7 +15,7 @@ from rdstitch.errors import LimitError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.find import FoundImages
 from rdstitch.io import read_image, write_image
-from rdstitch.matching import prescreen
+from rdstitch.matching import candidate_pairs
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.pipeline import accept, blocks
 from rdstitch.pipeline.recipes import stitch_found
@@ -73,7 +73,7 @@ def test_every_image_finds_its_place_whatever_the_prescreen_does(
     monkeypatch: pytest.MonkeyPatch,
     glance: Callable[[PairEstimator, list[tuple[int, int]]], dict[tuple[int, int], None]],
 ) -> None:
-    monkeypatch.setattr(prescreen, "prescreen_pairs", glance)
+    monkeypatch.setattr(candidate_pairs, "prescreen_pairs", glance)
     rdstitch("mosaic", *frames, "-o", tmp_path / "out.png", "--strict", *CACHED)
 
 

@@ -2,7 +2,6 @@
 
 import ast
 import doctest
-import shutil
 import subprocess
 import sys
 from importlib import metadata
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 
 import rdstitch
+from tests.cli.running import copied
 
 
 def _run(test: doctest.DocTest) -> None:
@@ -24,10 +24,8 @@ def _run(test: doctest.DocTest) -> None:
 @pytest.fixture
 def images(frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The images that the examples name, in the current folder."""
-    (tmp_path / "flight").mkdir()
-    for name, frame in zip(("left", "middle", "right"), frames, strict=True):
-        shutil.copy(frame, tmp_path / f"{name}.png")
-        shutil.copy(frame, tmp_path / "flight")
+    copied(frames, tmp_path, "left.png", "middle.png", "right.png")
+    copied(frames, tmp_path / "flight")
     monkeypatch.chdir(tmp_path)
 
 

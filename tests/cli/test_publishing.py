@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from rdstitch.io import read_image
-from tests.cli.running import CACHED, FAST, Run, finished, sidecar_of, start
+from tests.cli.running import CACHED, FAST, Run, copied, finished, sidecar_of, start
 from tests.faults import OPERATIONS, Operation, failing_disk
 from tests.sampled import sampled
 
@@ -150,16 +150,13 @@ def test_an_image_beside_any_sidecar_does_not_vanish(rdstitch: Run, located: Pat
     assert (done.status, "warning" in done.err) == (0, False)
     assert len(sidecar_of(tmp_path / "out.tif")["images"]) == 3
     # What rdstitch wrote itself is no input of the next run, and that is said.
-    for name in ("field.tif", "field.tif.json"):
-        shutil.copy(located / name, flight)
+    own = [located / name for name in ("field.tif", "field.tif.json")]
+    copied(own, flight)
     rdstitch("mosaic", flight, "-o", tmp_path / "again.tif", *CACHED, told="rdstitch wrote them: field.tif")
     assert read_image(tmp_path / "again.tif").pixels.shape == read_image(tmp_path / "out.tif").pixels.shape
-    only = tmp_path / "only"
-    only.mkdir()
-    for name in ("field.tif", "field.tif.json"):
-        shutil.copy(located / name, only)
+    copied(own, tmp_path / "only")
     told = "no images but those that rdstitch wrote"
-    rdstitch("mosaic", only, "-o", tmp_path / "x.tif", status=3, told=told)
+    rdstitch("mosaic", tmp_path / "only", "-o", tmp_path / "x.tif", status=3, told=told)
 
 
 @pytest.mark.parametrize("name", ["frame_0001.jpg", "../flight/frame_0001.jpg"])

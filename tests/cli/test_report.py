@@ -3,7 +3,6 @@
 import base64
 import io
 import re
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -31,7 +30,7 @@ from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.verification.findings import Finding, Kind
 from rdstitch.verification.verdict import RefusedError
-from tests.cli.running import CACHED, OPTIONS, Run
+from tests.cli.running import CACHED, OPTIONS, Run, copied
 
 _VOID = {"meta", "img"}
 _SECTIONS = ["Summary", "Warnings and left-out images", "Mosaic", "Match graph", "Votes on λ", "Lens curve"]
@@ -189,9 +188,7 @@ def test_what_is_refused_is_shown(
 
 def test_names_are_escaped_and_vanished_images_do_not_matter(frames: list[Path], tmp_path: Path) -> None:
     names = ["<b>&\"bold'.png", "caf\udce9<.png"]
-    images = [tmp_path / name for name in names]
-    for frame, image in zip(frames, images, strict=False):
-        shutil.copy(frame, image)
+    images = copied(frames, tmp_path, *names)
     registration = calibrate(images, StitchOptions(workers=1, distortion=-0.2))
     for image in images:
         image.unlink()

@@ -121,7 +121,7 @@ def _write_bag(
 
 
 def _camera_info(store: Any, header: Any, camera: Camera) -> Any:
-    lens, _ = nearest_model(camera, "rational")
+    lens, _, _ = nearest_model(camera, {"rational": ""})
     k = np.array([camera.focal, 0.0, camera.center[0], 0.0, camera.focal, camera.center[1], 0.0, 0.0, 1.0])
     none = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, do_rectify=False)
     of_lens = {"distortion_model": "rational_polynomial", "d": np.array(lens.coefficients), "k": k}

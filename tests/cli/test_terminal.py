@@ -21,14 +21,14 @@ from rdstitch.synthetic import ground
 from tests.cli.running import CACHED, DISTORTION, FAST, Outcome, Run, finished, start, state_of
 from tests.sampled import sampled
 
-_RUN = "from rdstitch_cli.main import main; main()"
+_PROGRAM = "from rdstitch_cli.main import main; main()"
 
 
 def _process(*arguments: str | Path, **environment: str) -> "subprocess.CompletedProcess[bytes]":
     locale = ("LC_", "LANG", "PYTHONUTF8")
     inherited = {name: value for name, value in os.environ.items() if not name.startswith(locale)}
     return subprocess.run(
-        [sys.executable, "-c", _RUN, *arguments], capture_output=True, check=False, env={**inherited, **environment}
+        [sys.executable, "-c", _PROGRAM, *arguments], capture_output=True, check=False, env={**inherited, **environment}
     )
 
 
@@ -72,18 +72,8 @@ def test_preview_is_small_and_leaves_what_is_given(rdstitch: Run, frames: list[P
 def test_a_preview_may_have_its_size_from_elsewhere(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     area = ("--extent", "0,0,100,100")
     # As without --preview: what is wrong is that these images have no place on the map.
-    rdstitch(
-        "pano",
-        *frames,
-        "-o",
-        tmp_path / "a.png",
-        "--preview",
-        *area,
-        "-j",
-        "1",
-        status=2,
-        told="extent needs GPS positions",
-    )
+    wanted = ("pano", *frames, "-o", tmp_path / "a.png", "--preview", *area, "-j", "1")
+    rdstitch(*wanted, status=2, told="extent needs GPS positions")
 
 
 def test_quality_makes_files_smaller(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
@@ -143,7 +133,6 @@ def test_tilde_is_the_home_folder_where_no_shell_saw_it(
     assert FilePath().convert("~no-such-user/x", None, None) == Path("~no-such-user/x")
 
 
-_PROGRAM = "from rdstitch_cli.main import main; main()"
 _CLOSED = "import os, sys; [os.close(n) for n in {}]; os.execv({!r}, [{!r}, '-c', {!r}, *sys.argv[1:]])"
 
 

@@ -20,36 +20,22 @@ from tests.cli.faulty import Make
 from tests.cli.running import CACHED, DISTORTION, Run, finished, sidecar_of, start
 
 
-def _saved(good: Path, file: Path, change: Callable[[Image.Image], Image.Image], **options: Any) -> Path:
-    with Image.open(good) as image:
-        change(image).save(file, **options)
-    return file
+def _saved(suffix: str, change: Callable[[Image.Image], Image.Image] = Image.Image.copy, exif: Any = ()) -> Make:
+    """Saves an image that was changed, with tags."""
+
+    def make(good: Path, folder: Path) -> Path:
+        tags = Image.Exif()
+        tags.update(exif)
+        with Image.open(good) as image:
+            change(image).save(folder / f"odd{suffix}", exif=tags)
+        return folder / f"odd{suffix}"
+
+    return make
 
 
-def _cmyk(good: Path, folder: Path) -> Path:
-    return _saved(good, folder / "odd.jpg", lambda image: image.convert("CMYK"))
-
-
-def _palette(good: Path, folder: Path) -> Path:
-    return _saved(good, folder / "odd.png", lambda image: image.quantize(200))
-
-
-def _transparent(good: Path, folder: Path) -> Path:
-    def change(image: Image.Image) -> Image.Image:
-        image.putalpha(Image.fromarray(np.where(np.indices((300, 400))[0] < 20, 0, 255).astype(np.uint8)))
-        return image
-
-    return _saved(good, folder / "odd.png", change)
-
-
-def _grey(good: Path, folder: Path) -> Path:
-    return _saved(good, folder / "odd.png", lambda image: image.convert("L"))
-
-
-def _turned(good: Path, folder: Path) -> Path:
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    return _saved(good, folder / "odd.jpg", lambda image: image.transpose(Image.Transpose.ROTATE_90), exif=exif)
+def _transparent(image: Image.Image) -> Image.Image:
+    image.putalpha(Image.fromarray(np.where(np.indices((300, 400))[0] < 20, 0, 255).astype(np.uint8)))
+    return image
 
 
 def _with_a_hole(good: Path, folder: Path) -> Path:
@@ -69,16 +55,19 @@ def _sixteen_bit(good: Path, folder: Path) -> Path:
     return folder / "b.png"
 
 
-def _hostile_exif(good: Path, folder: Path) -> Path:
-    exif = Image.Exif()
-    exif[0x010F] = "\x1b[31m" * 500
-    exif[0x8769] = {0x920A: (0, 0)}
-    return _saved(good, folder / "odd.jpg", lambda image: image, exif=exif)
+ODD: dict[str, Make] = {
+    "inks": _saved(".jpg", lambda image: image.convert("CMYK")),
+    "palette": _saved(".png", lambda image: image.quantize(200)),
+    "transparent": _saved(".png", _transparent),
+    "grey": _saved(".png", lambda image: image.convert("L")),
+    "turned": _saved(".jpg", lambda image: image.transpose(Image.Transpose.ROTATE_90), {0x0112: 6}),
+    "hole": _with_a_hole,
+    "16 bits": _sixteen_bit,
+    "hostile tags": _saved(".jpg", exif={0x010F: "\x1b[31m" * 500, 0x8769: {0x920A: (0, 0)}}),
+}
 
 
-@pytest.mark.parametrize(
-    "make", [_cmyk, _palette, _transparent, _grey, _turned, _with_a_hole, _sixteen_bit, _hostile_exif]
-)
+@pytest.mark.parametrize("make", ODD.values(), ids=ODD)
 def test_unusual_images_are_stitched(rdstitch: Run, place: Path, make: Make) -> None:
     odd = make(place / "b.png", place)
     done = rdstitch("pano", place / "a.png", odd, "-o", place / "out.tif", *CACHED, err="")

@@ -24,118 +24,92 @@ from rdstitch.matching.links import Link
 
 @dataclass(frozen=True)
 class QuarterTurns:
-    """By which quarter turns of EXIF (1, 3, 6, 8) images became upright: what is known of them as the camera stored
-    them, and back.
-    """
+    """Quarter turns of images by orientations of EXIF (1, 3, 6, 8), and what is known of the images after them."""
 
-    upright: tuple[int, ...]
+    orientations: tuple[int, ...]
 
     @classmethod
     def of(cls, sources: Sequence[Source]) -> Self:
-        """Of images by their headers."""
+        """Those by which images became upright, by their headers."""
         return cls(tuple(quarter_turn(source.metadata.orientation) for source in sources))
 
     @cached_property
-    def back(self) -> tuple[int, ...]:
-        """What leads back from upright images."""
-        return tuple(inverse(orientation) for orientation in self.upright)
+    def back(self) -> "QuarterTurns":
+        """The inverse ones: those that lead back from upright images to stored ones."""
+        return QuarterTurns(tuple(map(inverse, self.orientations)))
 
     @property
-    def matrices_back(self) -> FloatArray:
-        """Rotations (N, 3, 3) about the optical axis from upright images."""
-        return _turns(self.back)
+    def none(self) -> bool:
+        """Whether no image is turned."""
+        return set(self.orientations) <= {1}
 
-    def stored_camera(self, camera: Camera, image: int) -> Camera:
+    @cached_property
+    def matrices(self) -> FloatArray:
+        """Rotations (N, 3, 3) about the optical axis."""
+        matrices = np.tile(np.eye(3), (len(self.orientations), 1, 1))
+        matrices[:, :2, :2] = [turning_matrix(orientation) for orientation in self.orientations]
+        return matrices
+
+    def camera(self, camera: Camera, image: int) -> Camera:
         """The camera of an image."""
-        return camera.turned(self.back[image])
+        return camera.turned(self.orientations[image])
 
-    def stored_tilts(self, tilts: FloatArray) -> FloatArray:
+    def tilts(self, tilts: FloatArray) -> FloatArray:
         """Tilts (ψ, θ) (N, 2), radians, of the cameras."""
-        return _turned_tilts(tilts, self.back)
+        normals = self.directions(rotation_from_tilt(tilts)[..., 2])
+        return np.where(np.array(self.orientations)[:, None] != 1, tilt_from_normal(normals), tilts)
 
-    def upright_tilts(self, tilts: FloatArray) -> FloatArray:
-        """Tilts (ψ, θ) (N, 2), radians, of the upright images."""
-        return _turned_tilts(tilts, self.upright)
-
-    def stored_directions(self, directions: FloatArray) -> FloatArray:
-        """Directions (N, 3), one in the axes of each upright image, in those of the cameras."""
-        turned: FloatArray = np.einsum("nij,nj->ni", _turns(self.back), directions)
+    def directions(self, directions: ArrayLike) -> FloatArray:
+        """Directions (N, 3), one in the axes of each camera."""
+        turned: FloatArray = np.einsum("nij,nj->ni", self.matrices, np.asarray(directions))
         return turned
 
-    def stored_point(self, point: FloatArray, image: int) -> FloatArray:
-        """A point (2,), from the middle of an upright image."""
-        turned: FloatArray = turning_matrix(self.back[image]) @ point
+    def point(self, point: FloatArray, image: int) -> FloatArray:
+        """A point (2,), from the middle of an image."""
+        turned: FloatArray = self.matrices[image, :2, :2] @ point
         return turned
 
-    def stored_link(self, link: Link, cameras: Sequence[Camera]) -> Link:
-        """Correspondences of upright images of these cameras."""
-        turns = self.back[link.image1], self.back[link.image2]
-        if turns == (1, 1):
+    def link(self, link: Link, cameras: Sequence[Camera]) -> Link:
+        """Correspondences of images of these cameras."""
+        images, relation = [link.image1, link.image2], link.relation
+        if all(self.orientations[k] == 1 for k in images):
             return link
-        relation, (first, second) = link.relation, _turns(turns)
-        camera, camera2 = relation.camera.turned(turns[0]), relation.camera2.turned(turns[1])
-        return replace(
-            link,
-            points1=_turned_points(link.points1, cameras[link.image1], turns[0]),
-            points2=_turned_points(link.points2, cameras[link.image2], turns[1]),
-            relation=relation.reexpressed(second @ relation.homography @ first.T, camera, camera2),
+        points1, points2 = (
+            self.camera(cameras[k], k).denormalize(cameras[k].normalize(points) @ self.matrices[k, :2, :2].T)
+            for k, points in zip(images, (link.points1, link.points2), strict=True)
         )
+        camera, camera2 = self.camera(relation.camera, link.image1), self.camera(relation.camera2, link.image2)
+        turned = self.matrices[link.image2] @ relation.homography @ self.matrices[link.image1].T
+        relation = relation.reexpressed(turned, camera, camera2)
+        return replace(link, points1=points1, points2=points2, relation=relation)
 
-    def stored_alignment(self, alignment: Alignment) -> Alignment:
-        """An alignment of upright images."""
-        return _turned_alignment(alignment, self.back, None)
+    def alignment(self, alignment: Alignment, gravity: ArrayLike | None = None) -> Alignment:
+        """An alignment, in the frame of the reference as it is after its turn.
 
-    def upright_alignment(self, alignment: Alignment, gravity: ArrayLike | None) -> Alignment:
-        """An alignment of images as the camera stored them; gravity (N, 3) is down in the axes of the cameras."""
-        down = None if gravity is None else np.einsum("nij,nj->ni", _turns(self.upright), np.asarray(gravity))
-        return _turned_alignment(alignment, self.upright, down)
-
-
-def _turns(orientations: Sequence[int]) -> FloatArray:
-    """Rotations (N, 3, 3) about the optical axis by orientations 1, 3, 6 and 8."""
-    matrices = np.tile(np.eye(3), (len(orientations), 1, 1))
-    matrices[:, :2, :2] = [turning_matrix(orientation) for orientation in orientations]
-    return matrices
-
-
-def _turned_tilts(tilts: FloatArray, orientations: Sequence[int]) -> FloatArray:
-    """Tilts (ψ, θ) (N, 2), radians, of images after orientations 1, 3, 6 and 8."""
-    normals = rotation_from_tilt(tilts)[..., 2]
-    turned = np.array(orientations)[:, None] != 1
-    return np.where(turned, tilt_from_normal(np.einsum("nij,nj->ni", _turns(orientations), normals)), tilts)
-
-
-def _turned_points(points: FloatArray, camera: Camera, orientation: int) -> FloatArray:
-    return camera.turned(orientation).denormalize(camera.normalize(points) @ turning_matrix(orientation).T)
-
-
-def _turned_alignment(alignment: Alignment, orientations: Sequence[int], gravity: FloatArray | None) -> Alignment:
-    """The same alignment of the images after orientations 1, 3, 6 and 8, in the frame of the reference as it is then.
-
-    Gravity (N, 3) is down in the axes of the cameras of the turned images; NaN where it is not known.
-    """
-    if all(orientation == 1 for orientation in orientations):
-        return alignment
-    turn, used, reference = _turns(orientations), alignment.used, alignment.reference
-    turn_of_reference, poses = turn[reference], alignment.poses
-    homographies = np.array(alignment.homographies)
-    if alignment.on_sphere:
-        matrices = turn[used] @ np.linalg.inv(homographies[used])
-        matrices /= np.linalg.norm(matrices[:, 2], axis=1)[:, None, None]  # diag(f, f, 1) R
-        place = int(used[:reference].sum())
-        homographies[used] = levelled(matrices, place, None if gravity is None else gravity[used])
-    else:
-        plane = turn_of_reference
-        if poses is not None:
-            poses, plane = _turned_poses(poses, turn, reference)
-        homographies[used] = plane @ homographies[used] @ turn[used].transpose(0, 2, 1)
-    return replace(
-        alignment,
-        cameras=tuple(c.turned(o) for c, o in zip(alignment.cameras, orientations, strict=True)),
-        homographies=homographies,
-        poses=poses,
-        covariance=_turned_covariance(alignment, turn_of_reference[:2, :2]),
-    )
+        Gravity (N, 3) is down in the axes of the cameras before the turns; NaN where it is not known.
+        """
+        if self.none:
+            return alignment
+        turn, used, reference = self.matrices, alignment.used, alignment.reference
+        poses, homographies = alignment.poses, np.array(alignment.homographies)
+        if alignment.on_sphere:
+            matrices = turn[used] @ np.linalg.inv(homographies[used])
+            matrices /= np.linalg.norm(matrices[:, 2], axis=1)[:, None, None]  # diag(f, f, 1) R
+            place = int(used[:reference].sum())
+            down = None if gravity is None else self.directions(gravity)[used]
+            homographies[used] = levelled(matrices, place, down)
+        else:
+            plane = turn[reference]
+            if poses is not None:
+                poses, plane = _turned_poses(poses, turn, reference)
+            homographies[used] = plane @ homographies[used] @ turn[used].transpose(0, 2, 1)
+        return replace(
+            alignment,
+            cameras=tuple(self.camera(camera, k) for k, camera in enumerate(alignment.cameras)),
+            homographies=homographies,
+            poses=poses,
+            covariance=_turned_covariance(alignment, turn[reference, :2, :2]),
+        )
 
 
 def _turned_poses(poses: PlanarPoses, turn: FloatArray, reference: int) -> tuple[PlanarPoses, FloatArray]:

@@ -22,11 +22,11 @@ from rdstitch.alignment.least_squares.normal_equations import ImageEquations, Sp
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import ModelMatrices, MotionModel
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.levenberg_marquardt import MAX_DAMPING, damping_by_gain
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
-from rdstitch.robust.posterior import costs, curvatures, slopes
+from rdstitch.robust.posterior import Prior, of_each
 
 MIN_GAIN = 1e-5
 """Expected relative fall of the loss that is worth another step: a hundredth of the noise."""
@@ -66,7 +66,7 @@ class FreeParameters:
     lens: BoolArray
 
     @classmethod
-    def fixing(cls, model: MotionModel, count: int, references: FloatArray | list[int], lens: BoolArray) -> Self:
+    def fixing(cls, model: MotionModel, count: int, references: IntArray | list[int], lens: BoolArray) -> Self:
         """All but the gauge of the reference images, one for each connected part of the graph."""
         poses = np.ones((count, model.pose_size), dtype=np.bool_)
         poses[np.asarray(references, dtype=np.intp)] = ~model.gauge
@@ -208,7 +208,7 @@ class BundleAdjuster:
 
     def _descend(self, parameters: Parameters, sigma: float, width: float, damping: float, max_steps: int) -> _Descent:
         """Levenberg-Marquardt at one width of the loss, in at most so many linearizations and steps that fail."""
-        steps, failures, moved = 1, 0, True
+        steps, failures, moved, converged = 1, 0, True, False
         while steps < max_steps:
             if moved:
                 state, moved = self.linearized(parameters, width), False
@@ -217,14 +217,14 @@ class BundleAdjuster:
             try:
                 step_poses, step_shared = normal.solve(damping)
             except np.linalg.LinAlgError:  # no correspondence of some images can be transferred
-                return _Descent(parameters, errors, damping, steps, False)
+                break
             # The decrease of the quadratic model, less what the damping adds to it.
             predicted = -(np.vdot(normal.gradient_poses, step_poses) + normal.gradient_shared @ step_shared)
             if not np.isfinite(predicted):
-                return _Descent(parameters, errors, damping, steps, False)
+                break
             if predicted <= self.min_gain * max(cost, 1e-12):
-                if failures or damping <= _FIRST_DAMPING:
-                    return _Descent(parameters, errors, damping, steps, True)
+                if converged := bool(failures or damping <= _FIRST_DAMPING):
+                    break
                 damping = _FIRST_DAMPING  # steps that an earlier damping makes short show no minimum
                 continue
             trial, after = parameters.retract(self.model, step_poses, step_shared, self.free.lens), np.inf
@@ -237,8 +237,8 @@ class BundleAdjuster:
             if after < cost:
                 parameters, errors, moved = trial, trial_error, True
             elif damping > MAX_DAMPING:
-                return _Descent(parameters, errors, damping, steps, False)
-        return _Descent(parameters, errors, damping, steps, False)
+                break
+        return _Descent(parameters, errors, damping, steps, converged)
 
     def linearized(self, parameters: Parameters, width: float) -> _State:
         """The errors at some parameters, linearized and weighted by a loss of this width, pixels."""
@@ -278,7 +278,8 @@ class BundleAdjuster:
         With a focal length that grows without limit a turn becomes a shift over a plane, and ground a tilt.
         """
         physical = self.model.physical_parameters(parameters.shared)[0]
-        return costs(self.priors.shared, physical) + costs(self.priors.lens, parameters.lens)
+        shared, lens = of_each(Prior.cost, self.priors.shared, physical), self.priors.lens
+        return float(shared.sum() + of_each(Prior.cost, lens, parameters.lens).sum())
 
     def _prior_cost(self, parameters: Parameters) -> float:
         offsets = self.model.prior_coordinates(parameters.poses) - self.priors.poses
@@ -302,8 +303,8 @@ class BundleAdjuster:
         p, lens = self.priors, self.free.lens
         physical, derivative = self.named_parameters(state.parameters.shared)
         slope, precision = (
-            np.concatenate([of(p.shared, physical), of(p.lens, state.parameters.lens)[lens]])
-            for of in (slopes, curvatures)
+            np.concatenate([of_each(of, p.shared, physical), of_each(of, p.lens, state.parameters.lens)[lens]])
+            for of in (Prior.slope, Prior.curvature)
         )
         poses = self.model.prior_coordinates(state.parameters.poses) - p.poses
         return normal.with_priors(

@@ -11,15 +11,14 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.alignment.adjustment_problem import Fit, Problem
+from rdstitch.alignment.adjustment_problem import Fit, LinkProblem, Problem
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.least_squares.observations import Observations
-from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.noise import Coherence, coherence, evidence_of
 from rdstitch.alignment.pairwise import pairwise_homographies
 from rdstitch.arrays import BoolArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, LENS_STD
-from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, costs
+from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, Prior, of_each
 
 LENSES: dict[str, tuple[str, ...]] = {
     "division": ("distortion",),
@@ -73,35 +72,30 @@ def free_parameters(name: str) -> BoolArray:
     return np.array([parameter in LENSES[name] for parameter in LENS_PARAMETERS])
 
 
-def choose_lens(
-    observations: Observations, pairwise: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
-) -> LensChoice:
+def choose_lens(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Sequence[str]) -> LensChoice:
     """Choose among lenses, keys of :data:`LENSES` from the simplest; none where the lens is given.
 
     ``pairwise`` is every link on its own with a homography, and λ free unless the lens is given.
     """
     if not names:
         return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), pairwise, "given")
+    observations, images = links.observations, links.observations.image_count
     if len(names) > 1 and len(observations) > _ENOUGH_LINKS:
-        return _choose_by_some(observations, pairwise, names, known)
-    images = observations.image_count
+        return _choose_by_some(links, pairwise, names)
     few = len(names) > 1 and images < ENOUGH_IMAGES
     if few:
         names = [name for name in names if name != "division-center"]
     free = [free_parameters(name) & ~(CENTER & few) for name in names]
 
-    def fit(free: BoolArray, start: BundleAdjustmentResult) -> BundleAdjustmentResult:
-        return pairwise_homographies(observations, start.homographies, start.parameters.lens, free, known)
-
     if len(names) == 1:
-        return LensChoice(
-            names[0], free[0], pairwise if names[0] == "division" else fit(free[0], pairwise), "as requested"
-        )
+        if names[0] != "division":
+            pairwise = pairwise_homographies(links.at(pairwise, free[0]))
+        return LensChoice(names[0], free[0], pairwise, "as requested")
     fits, best = [pairwise], 0
     for index, name in enumerate(names[1:], start=1):
         if name == "division3" and names[best] != "division2":
             break  # the next term of a series that is not needed
-        fits.append(fit(free[index], fits[-1]))
+        fits.append(pairwise_homographies(links.at(fits[-1], free[index])))
         evidence = evidence_of(observations, fits[-1].errors)
         rarer = 0.0 if names[best] == "division2" else TWENTY_TO_ONE  # a series that was cut off has a next term
         if _score(evidence, observations, fits[index]) + rarer < _score(evidence, observations, fits[best]):
@@ -113,18 +107,15 @@ def choose_lens(
     return LensChoice(names[best], free[best], fits[best], reason, refinements)
 
 
-def _choose_by_some(
-    observations: Observations, pairwise: BundleAdjustmentResult, names: Sequence[str], known: CameraPriors
-) -> LensChoice:
+def _choose_by_some(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Sequence[str]) -> LensChoice:
     """The lens that evenly chosen links show, and every link on its own with it."""
-    start, simplest = pairwise.parameters.lens, free_parameters("division")
-    some = np.arange(0, len(observations), -(-len(observations) // _ENOUGH_LINKS))
-    few = observations.subset(some)
-    choice = choose_lens(
-        few, pairwise_homographies(few, pairwise.homographies[some], start, simplest, known), names, known
-    )
+    simplest = free_parameters("division")
+    some = np.arange(0, len(links.observations), -(-len(links.observations) // _ENOUGH_LINKS))
+    few = links.at(pairwise, simplest)
+    few = replace(few, observations=few.observations.subset(some), homographies=few.homographies[some])
+    choice = choose_lens(few, pairwise_homographies(few), names)
     if (choice.free != simplest).any():
-        pairwise = pairwise_homographies(observations, pairwise.homographies, start, choice.free, known)
+        pairwise = pairwise_homographies(links.at(pairwise, choice.free))
     return replace(choice, pairwise=pairwise)
 
 
@@ -159,7 +150,7 @@ def _score(evidence: Evidence, observations: Observations, fit: BundleAdjustment
     shared = 2.0 * len(observations.points1) / float(seen.count[0])
     relative = fit.covariance * shared / np.outer(LENS_STD[free], LENS_STD[free])
     narrowed = -np.log(np.clip(np.linalg.eigvalsh(relative), 1e-300, 1.0)).sum()
-    return float(seen.cost[0]) + costs(LENS, lens) + float(narrowed)
+    return float(seen.cost[0] + of_each(Prior.cost, LENS, lens).sum() + narrowed)
 
 
 def _reason(names: Sequence[str], fits: Sequence[BundleAdjustmentResult], best: int) -> str:

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from rdstitch.alignment.adjusted_images import GivenImages
+from rdstitch.alignment.adjustment_problem import LinkProblem
+from rdstitch.alignment.alignment_options import GivenImages
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import CameraPriors
@@ -30,26 +31,28 @@ def choose_observable_lens(
 ) -> LensChoice:
     """Of every link with a homography of its own: whether λ is seen, or could be depth, and which lens it is."""
 
-    def fit(lens: FloatArray, free: BoolArray) -> BundleAdjustmentResult:
-        return pairwise_homographies(sample, relations_at(sample, relations, lens), lens, free, known)
+    def links_at(lens: FloatArray, free: BoolArray) -> LinkProblem:
+        return LinkProblem(sample, relations_at(sample, relations, lens), lens, free, known)
 
     options, first, none = task.options, np.arange(len(LENS_STD)) == 0, np.zeros(len(LENS_STD), dtype=np.bool_)
     # The images' points are already relative to the centre of the camera.
     given = np.array([*task.cameras[0].coefficients, 0.0, 0.0])
     if options.lens_known:
-        return choose_lens(sample, fit(given, none), (), known)
+        links = links_at(given, none)
+        return choose_lens(links, pairwise_homographies(links), ())
     votes = vote([k.relation.distortion for k in task.links], [k.relation.distortion_std for k in task.links])
-    pairwise = fit(np.where(first, np.nan_to_num(votes.distortion), 0.0), first)
+    links = links_at(np.where(first, np.nan_to_num(votes.distortion), 0.0), first)
+    pairwise = pairwise_homographies(links)
     observable, depth = _observable(pairwise), False
     if sample.image_count <= _FEW_VIEWS or not observable:
-        with_given_lens = fit(given, none)
+        with_given_lens = pairwise_homographies(links_at(given, none))
         depth = observable and _is_depth(pairwise, with_given_lens)
         if depth or not observable:
             pairwise, observable = with_given_lens, False
     if not observable:
-        choice = choose_lens(sample, pairwise, (), known)
+        choice = choose_lens(links, pairwise, ())
         return replace(choice, reason="λ is not observable", observable=False, depth=depth)
-    return choose_lens(sample, pairwise, options.lenses, known)
+    return choose_lens(links, pairwise, options.lenses)
 
 
 def _is_depth(free_lens: BundleAdjustmentResult, given_lens: BundleAdjustmentResult) -> bool:

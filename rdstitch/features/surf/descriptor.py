@@ -6,15 +6,12 @@ wavelets, which are not isotropic; and the window has a smooth edge, so that a g
 just in or out. The descriptor holds sums of Haar responses in 4 x 4 cells of a patch that is turned by it.
 """
 
-from dataclasses import dataclass
-from typing import Self
-
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.features.keypoints import Features
-from rdstitch.features.surf.hessian import Blobs, find_blobs
+from rdstitch.features.keypoints import Detection, Features
+from rdstitch.features.surf.hessian import find_blobs
 from rdstitch.features.surf.patches import Grey, apply_kernels, integer_kernels, pyramid, sample_patches
 from rdstitch.features.surf.refinement import refine
 
@@ -120,67 +117,26 @@ def _describe(patches: NDArray[np.float32]) -> NDArray[np.float32]:
     du = (down[:, :, 1:] - down[:, :, :-1]) * _RESPONSE_WEIGHTS
     right = patches[:, :, 1:] + patches[:, :, :-1]
     dv = (right[:, 1:] - right[:, :-1]) * _RESPONSE_WEIGHTS
-    cells = np.stack([_cell_sums(values) for values in (du, dv, np.abs(du), np.abs(dv))], axis=-1).reshape(
-        len(patches), -1
-    )
+    parts = np.stack([du, dv, np.abs(du), np.abs(dv)]).reshape(4, -1, _CELLS, _SAMPLES, _CELLS, _SAMPLES)
+    cells: NDArray[np.float32] = np.moveaxis(parts.sum(axis=3).sum(axis=4), 0, -1).reshape(len(patches), -1)
     norm: NDArray[np.float32] = np.sqrt((cells**2).sum(axis=1, keepdims=True))
     return np.divide(cells, norm, out=np.zeros_like(cells), where=norm > 0)
 
 
-def _cell_sums(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Sums over cells, (N, 20, 20) to (N, 16)."""
-    cells = values.reshape(-1, _CELLS, _SAMPLES, _CELLS, _SAMPLES)
-    total: NDArray[np.float32] = cells.sum(axis=2).sum(axis=3).reshape(-1, _CELLS**2)
-    return total
+_PLACE = np.arange(_SIDE) - (_SIDE - 1) / 2
+_RESPONSE_WEIGHTS = np.exp(-(_PLACE[:, None] ** 2 + _PLACE**2) / (2 * _RESPONSE_SIGMA**2)).astype(np.float32)
+"""Gaussian weight of each response, (20, 20)."""
 
 
-def _response_weights() -> NDArray[np.float32]:
-    """Gaussian weight of each response, shape (20, 20)."""
-    place = np.arange(_SIDE) - (_SIDE - 1) / 2
-    return np.exp(-(place[:, None] ** 2 + place**2) / (2 * _RESPONSE_SIGMA**2)).astype(np.float32)
+def detect_surf(grey: Grey) -> Detection:
+    """Find the blobs of an image, which are oriented when they are described."""
+    levels = pyramid(grey, _OCTAVES + 3)
+    blobs = refine(levels, find_blobs(grey, _THRESHOLD, _OCTAVES, _LAYERS))
 
+    def describe(chosen: NDArray[np.intp]) -> Features:
+        some = blobs.take(chosen)
+        angle = orientations(levels, some.points, some.scale)
+        descriptors = describe_patches(levels, some.points, some.scale, angle)
+        return Features(some.points, descriptors, some.size, angle, some.response, some.laplacian_sign, kind="surf")
 
-_RESPONSE_WEIGHTS = _response_weights()
-
-
-@dataclass(frozen=True, eq=False)
-class SurfDetection:
-    """Blobs of an image, to be described."""
-
-    levels: list[Grey]
-    blobs: Blobs
-
-    @classmethod
-    def find(cls, grey: Grey) -> Self:
-        """Find the blobs of an image."""
-        levels = pyramid(grey, _OCTAVES + 3)
-        return cls(levels, refine(levels, find_blobs(grey, _THRESHOLD, _OCTAVES, _LAYERS)))
-
-    @property
-    def points(self) -> FloatArray:
-        """Places, pixels of the image, (N, 2)."""
-        return self.blobs.points
-
-    @property
-    def scale(self) -> FloatArray:
-        """Diameters, pixels, (N,)."""
-        return self.blobs.size
-
-    @property
-    def response(self) -> FloatArray:
-        """Strengths, (N,)."""
-        return self.blobs.response
-
-    def describe(self, chosen: NDArray[np.intp]) -> Features:
-        """Orient and describe the chosen blobs."""
-        blobs = self.blobs.take(chosen)
-        angle = orientations(self.levels, blobs.points, blobs.scale)
-        return Features(
-            points=blobs.points,
-            descriptors=describe_patches(self.levels, blobs.points, blobs.scale, angle),
-            scale=blobs.size,
-            angle=angle,
-            response=blobs.response,
-            laplacian_sign=blobs.laplacian_sign,
-            kind="surf",
-        )
+    return Detection(blobs.points, blobs.size, blobs.response, describe)

@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 
 from examples.judging.trajectories import compare_trajectories
-from examples.worlds.alignment_scenes import Scene, aligned, grid, jittered, robot_path, scene
-from rdstitch.alignment import AlignmentOptions, AlignmentTask, GivenImages, align, most_matches_read
-from rdstitch.alignment.adjusted_images import AdjustedImages
-from rdstitch.alignment.build_result import _nearest_distortion_std, build_alignment
+from examples.worlds.alignment_scenes import Scene, aligned, grid, grid_scene, jittered, robot_path, scene
+from rdstitch.alignment import AlignmentOptions, AlignmentTask, align, most_matches_read
+from rdstitch.alignment.build_result import AdjustedImages, _nearest_distortion_std, build_alignment
 from rdstitch.alignment.frames.reference_frame import in_frame_of
 from rdstitch.alignment.least_squares.plane_marks import Sighting
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import Alignment, PlanarPoses, Unused
+from rdstitch.alignment.sentences import explain_unaligned
 from rdstitch.alignment.trajectory import Trajectory
-from rdstitch.alignment.unaligned import explain_unaligned
 from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError, RdstitchError, RegistrationError
 from rdstitch.geometry.camera import Camera
@@ -82,7 +81,7 @@ _OPTIONS: list[dict[str, object]] = [
 @pytest.mark.slow
 @pytest.mark.parametrize("model", get_args(ModelName))
 def test_every_model_goes_with_every_option_or_says_why_not(model: str) -> None:
-    given = scene(grid(2, 2, (0.4, 0.3), 0.2, np.random.default_rng(1)), rng=np.random.default_rng(1), per_link=40)
+    given = grid_scene(2, 2, seed=1, per_link=40)
     for options in _OPTIONS:
         try:
             found = aligned(given, model=model, **options)
@@ -104,10 +103,10 @@ def test_every_model_goes_with_every_option_or_says_why_not(model: str) -> None:
 def test_a_robots_grid_is_rigid(
     cells: tuple[int, int], size: tuple[int, int], focal: float, distortion: float, deg: tuple[float, float], yaw: float
 ) -> None:
-    rng = np.random.default_rng(cells[0])
-    poses = grid(*cells, (0.5, 0.4), math.radians(yaw), rng)
     tilt = (math.radians(deg[0]), math.radians(deg[1]))
-    given = scene(poses, size=size, focal=focal, distortion=distortion, tilt=tilt, rng=rng)
+    given = grid_scene(
+        *cells, (0.5, 0.4), math.radians(yaw), seed=cells[0], size=size, focal=focal, distortion=distortion, tilt=tilt
+    )
     found = aligned(given)
     assert found.model == "rigid"
     assert found.used.all()
@@ -122,23 +121,20 @@ def test_a_robots_grid_is_rigid(
 
 @pytest.mark.parametrize(("height", "tilt", "model"), [(0.2, 0.0, "similarity"), (0.2, 3.0, "tilting")])
 def test_a_drone_needs_more_freedom(height: float, tilt: float, model: str) -> None:
-    rng = np.random.default_rng(2)
-    poses = jittered(grid(4, 3, (0.4, 0.3), 0.25, rng), height, math.radians(tilt), rng)
-    given = scene(poses, tilt=(0.04, -0.03), focal_source="exif", rng=rng, per_link=120)
+    wind = height, math.radians(tilt)
+    given = grid_scene(4, 3, yaw=0.25, seed=2, tilt=(0.04, -0.03), focal_source="exif", per_link=120, wind=wind)
     found = aligned(given)
     assert found.model == model
     assert abs(found.distortion + 0.25) < 0.001
     assert float(np.quantile(_pair_errors(found, given), 0.95)) < 0.2
-    ratio = found.poses.height / np.exp(poses[:, LOG_HEIGHT])
+    ratio = found.poses.height / np.exp(given.poses[:, LOG_HEIGHT])
     assert float(np.std(ratio) / np.mean(ratio)) < 0.005
     if tilt:
-        assert found.tilt_spread == pytest.approx(float(np.sqrt(np.mean(poses[:, [PSI, THETA]] ** 2))), rel=0.25)
+        assert found.tilt_spread == pytest.approx(float(np.sqrt(np.mean(given.poses[:, [PSI, THETA]] ** 2))), rel=0.25)
 
 
 def test_focal_length_that_is_guessed_wrong_is_found() -> None:
-    rng = np.random.default_rng(4)
-    poses = grid(4, 3, (0.5, 0.4), 0.3, rng)
-    given = scene(poses, tilt=(0.1, -0.08), guess=690.0, focal_source="guess", rng=rng)
+    given = grid_scene(4, 3, (0.5, 0.4), 0.3, seed=4, tilt=(0.1, -0.08), guess=690.0, focal_source="guess")
     found = aligned(given)
     true = 520.0 / given.cameras[0].scale
     assert found.focal_std < 0.05 * true
@@ -147,8 +143,7 @@ def test_focal_length_that_is_guessed_wrong_is_found() -> None:
 
 
 def test_an_off_centre_lens_is_noticed_and_a_centred_one_left_alone() -> None:
-    rng = np.random.default_rng(6)
-    given = scene(grid(3, 3, (0.4, 0.3), 0.3, rng), rng=rng, per_link=120)
+    given = grid_scene(3, 3, yaw=0.3, seed=6, per_link=120)
     shift = np.array([14.0, -9.0])
     moved = [replace(link, points1=link.points1 + shift, points2=link.points2 + shift) for link in given.links]
     found = align(given.cameras, moved)
@@ -210,17 +205,14 @@ def test_turning_on_the_spot_says_nothing_of_the_lens() -> None:
 
 
 def test_hills_are_noticed() -> None:
-    rng = np.random.default_rng(10)
-    poses = jittered(grid(4, 3, (0.4, 0.3), 0.2, rng), 0.1, 0.03, rng)
-    found = aligned(scene(poses, rng=rng, relief=0.05))
+    found = aligned(grid_scene(4, 3, wind=(0.1, 0.03), seed=10, relief=0.05))
     assert found.relief.found
     assert found.relief.coherence > 0.6
     assert "not one plane" in found.relief.explanation
 
 
 def test_known_lens_and_tilt_are_kept() -> None:
-    rng = np.random.default_rng(11)
-    given = scene(grid(3, 2, (0.4, 0.3), 0.2, rng), tilt=(0.05, -0.04), rng=rng)
+    given = grid_scene(3, 2, seed=11, tilt=(0.05, -0.04))
     cameras = [replace(camera, distortion=-0.25) for camera in given.cameras]
     found = aligned(replace(given, cameras=cameras), lens_known=True, tilt=(0.05, -0.04))
     assert found.distortion == -0.25
@@ -241,8 +233,7 @@ def test_measured_attitudes_replace_estimated_ones(std: float, model: str) -> No
 
 
 def test_the_reference_image_is_the_frame() -> None:
-    rng = np.random.default_rng(13)
-    given = scene(grid(3, 2, (0.4, 0.3), 0.2, rng), rng=rng)
+    given = grid_scene(3, 2, seed=13)
     for model in ("similarity", "homography"):
         found = aligned(given, model=model, reference=4)
         assert found.reference == 4
@@ -273,9 +264,8 @@ def test_a_reduced_image_is_the_reference_only_where_it_is_named() -> None:
 
 def test_any_image_can_become_the_frame_after_the_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:
     """The adjustment may have held another one, turned and at another height: then the frame is changed."""
-    rng = np.random.default_rng(12)
-    poses = jittered(grid(3, 2, (0.4, 0.3), 1.2, rng), 0.2, 0.0, rng)
-    given = scene(poses, tilt=(0.05, -0.04), rng=rng)
+    given = grid_scene(3, 2, yaw=1.2, wind=(0.2, 0.0), seed=12, tilt=(0.05, -0.04))
+    poses = given.poses
     adjusted: list[AdjustedImages] = []
     recipe = import_module("rdstitch.alignment.recipe")
     monkeypatch.setattr(recipe, "build_alignment", adjusted.append)
@@ -312,8 +302,7 @@ def test_of_links_with_as_many_matches_those_that_overlap_most_are_chained(monke
 
 
 def test_the_order_of_links_does_not_matter() -> None:
-    rng = np.random.default_rng(14)
-    given = scene(grid(3, 2, (0.4, 0.3), 0.2, rng), rng=rng)
+    given = grid_scene(3, 2, seed=14)
     there, back = aligned(given), align(given.cameras, given.links[::-1])
     assert there.distortion == pytest.approx(back.distortion, abs=1e-5)
     assert there.model == back.model
@@ -321,8 +310,7 @@ def test_the_order_of_links_does_not_matter() -> None:
 
 @pytest.mark.parametrize(("most", "read"), sampled([(40, None), (200, 200)]))
 def test_links_need_no_more_matches_than_are_read(most: int, read: int | None) -> None:
-    rng = np.random.default_rng(5)
-    given = scene(grid(5, 4, (0.4, 0.3), 0.1, rng), per_link=220, rng=rng)
+    given = grid_scene(5, 4, yaw=0.1, seed=5, per_link=220)
     options = AlignmentOptions(max_matches_per_link=most, lens="division")
     assert most_matches_read(len(given.links), options) == read
     few = align(given.cameras, [link.thinned(read) for link in given.links], options)
@@ -340,8 +328,7 @@ def test_a_lens_at_the_limit_of_folding_has_a_deviation() -> None:
 
 
 def test_mistakes_of_the_caller() -> None:
-    rng = np.random.default_rng(15)
-    given = scene(grid(2, 1, (0.4, 0.3), 0.2, rng), rng=rng)
+    given = grid_scene(2, 1, seed=15)
     with pytest.raises(RegistrationError, match="no two images overlap"):
         align(given.cameras, [])
     with pytest.raises(ArgumentError, match="same images"):
@@ -377,14 +364,12 @@ def test_mistakes_of_the_caller() -> None:
     ],
 )
 def test_what_cannot_be_of_the_images_is_refused(options: dict[str, object], named: str) -> None:
-    rng = np.random.default_rng(15)
     with pytest.raises(ArgumentError, match=named):
-        aligned(scene(grid(2, 1, (0.4, 0.3), 0.2, rng), rng=rng), **options)
+        aligned(grid_scene(2, 1, seed=15), **options)
 
 
 def test_a_named_reference_in_another_group_is_missed_aloud() -> None:
-    rng = np.random.default_rng(9)
-    given = scene(grid(7, 1, (0.4, 0.3), 0.1, rng), rng=rng)
+    given = grid_scene(7, 1, yaw=0.1, seed=9)
     split = [link for link in given.links if (link.image1 < 5) == (link.image2 < 5)]
     for reference, missed in ((6, True), (2, False)):
         found = align(given.cameras, split, AlignmentOptions(reference=reference, lens="division"))
@@ -395,9 +380,9 @@ def test_a_named_reference_in_another_group_is_missed_aloud() -> None:
 def test_errors_that_neighbours_share_weigh_the_same_with_and_without_a_wrong_pair() -> None:
     rng = np.random.default_rng(4)
     given = scene(robot_path(10, 0.15), reach=3, rng=rng)
-    task = AlignmentTask(GivenImages(given.cameras, given.links, AlignmentOptions(model="rigid", lens="division")))
+    task = AlignmentTask(given.cameras, given.links, AlignmentOptions(model="rigid", lens="division"))
     links = [*given.links, _wrong_link(given, 0, 9, rng)]
-    with_wrong = replace(task, given=replace(task.given, links=links))
+    with_wrong = replace(task, links=links)
     selected, without = with_wrong._selected, task._selected
     assert without.problem.overdispersion > 1.2
     assert selected.kept_links.tolist() == [*[True] * len(given.links), False]
@@ -406,9 +391,8 @@ def test_errors_that_neighbours_share_weigh_the_same_with_and_without_a_wrong_pa
 
 
 def test_attitudes_known_exactly_determine_no_less_than_almost_exact_ones() -> None:
-    rng = np.random.default_rng(12)
-    poses = jittered(grid(4, 3, (0.4, 0.3), 0.2, rng), 0.1, 0.05, rng)
-    given, attitudes = scene(poses, tilt=(0.03, 0.02), rng=rng, per_link=80), poses[:, [PSI, THETA]]
+    given = grid_scene(4, 3, wind=(0.1, 0.05), seed=12, tilt=(0.03, 0.02), per_link=80)
+    attitudes = given.poses[:, [PSI, THETA]]
     std = [
         aligned(given, model="tilting", lens="division", attitudes=attitudes, attitudes_std=scatter).distortion_std
         for scatter in (0.0, 1e-6, 1e-4, 1e-2)
@@ -418,8 +402,7 @@ def test_attitudes_known_exactly_determine_no_less_than_almost_exact_ones() -> N
 
 
 def test_an_image_that_contradicts_the_others_names_them() -> None:
-    rng = np.random.default_rng(11)
-    found = aligned(scene(grid(2, 1, (0.4, 0.3), 0.2, rng), rng=rng))
+    found = aligned(grid_scene(2, 1, seed=11))
     contradicting = replace(found.links[0], image1=0, image2=2, used=False, reason=Unused.CONTRADICTS)
     whole = replace(
         found, used=np.array([True, True, False]), components=((0, 1), (2,)), links=(*found.links, contradicting)
@@ -431,9 +414,10 @@ def test_an_image_that_contradicts_the_others_names_them() -> None:
 
 def test_small_tilts_do_not_ask_for_a_short_focal_length() -> None:
     """Images show tilts divided by the focal length, and hardly show that itself over rough ground."""
-    rng = np.random.default_rng(3)
-    poses = jittered(grid(12, 1, (0.35, 0.1), 0.1, rng), 0.05, math.radians(1.5), rng)
-    given = scene(poses, noise=0.5, per_link=60, relief=0.02, reach=2, focal_source=None, rng=rng)
+    wind = 0.05, math.radians(1.5)
+    given = grid_scene(
+        12, 1, (0.35, 0.1), 0.1, seed=3, noise=0.5, per_link=60, relief=0.02, reach=2, focal_source=None, wind=wind
+    )
     found = aligned(given, model="tilting", lens="division")
     assert abs(math.log(found.focal * given.cameras[0].scale / 520.0)) < 0.3
 

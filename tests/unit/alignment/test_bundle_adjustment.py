@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from examples.worlds.alignment_scenes import Scene, grid, jittered, scene
+from examples.worlds.alignment_scenes import Scene, grid_scene
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters
 from rdstitch.alignment.least_squares.link_equations import link_equations, squared_lengths, trial_errors
 from rdstitch.alignment.least_squares.normal_equations import SparseNormalEquations, assemble
@@ -18,9 +18,7 @@ ONE_LENS = np.array([True, False, False, False, False])
 
 
 def _scene() -> Scene:
-    rng = np.random.default_rng(3)
-    poses = jittered(grid(3, 2, (0.4, 0.35), 0.2, rng), 0.1, 0.02, rng)
-    return scene(poses, tilt=(0.05, -0.04), rng=rng, per_link=60)
+    return grid_scene(3, 2, (0.4, 0.35), 0.2, wind=(0.1, 0.02), seed=3, tilt=(0.05, -0.04), per_link=60)
 
 
 def _start(model: MotionModel, truth: Scene) -> Parameters:
@@ -146,9 +144,7 @@ def _adjust(model: MotionModel, truth: Scene, seen: Observations) -> tuple[float
 def test_stated_standard_deviation_is_the_scatter() -> None:
     errors = []
     for seed in range(30):
-        rng = np.random.default_rng(seed)
-        poses = grid(2, 2, (0.4, 0.35), 0.3, rng)
-        truth = scene(poses, rng=rng, per_link=50, noise=0.5, outliers=0.0)
+        truth = grid_scene(2, 2, (0.4, 0.35), 0.3, seed=seed, per_link=50, noise=0.5, outliers=0.0)
         value, std = _adjust(HOMOGRAPHY, truth, Observations.from_links(truth.links, truth.cameras))
         errors.append((value - truth.distortion) / std)
     assert 0.7 < float(np.std(errors)) < 1.4
@@ -156,19 +152,16 @@ def test_stated_standard_deviation_is_the_scatter() -> None:
 
 
 def test_outliers_do_not_move_the_result() -> None:
-    rng = np.random.default_rng(5)
-    poses = grid(3, 2, (0.4, 0.35), 0.3, rng)
-    truth = scene(poses, rng=rng, noise=0.3, outliers=0.3)
+    truth = grid_scene(3, 2, (0.4, 0.35), 0.3, seed=5, noise=0.3, outliers=0.3)
     value, std = _adjust(RIGID, truth, Observations.from_links(truth.links, truth.cameras))
     assert abs(value - truth.distortion) < 5 * std < 0.005
 
 
 def test_the_focal_length_of_a_long_strip_is_the_same_from_wherever_it_starts() -> None:
     """It is hardly seen beside the tilts of all images: damping would leave it near its start."""
-    rng = np.random.default_rng(5)
-    poses = jittered(grid(25, 2, (0.3, 0.5), 0.1, rng), 0.05, 0.02, rng)
-    truth = scene(poses, tilt=(0.02, -0.03), noise=0.2, rng=rng, per_link=120)
-    count, true = len(poses), np.log(520.0 / truth.cameras[0].scale)
+    wind = 0.05, 0.02
+    truth = grid_scene(25, 2, (0.3, 0.5), 0.1, seed=5, tilt=(0.02, -0.03), noise=0.2, per_link=120, wind=wind)
+    count, true = len(truth.poses), np.log(520.0 / truth.cameras[0].scale)
     freedom = FreeParameters.fixing(TILTING, count, [0], ONE_LENS)
     seen = Observations.from_links(truth.links, truth.cameras)
     adjuster = BundleAdjuster(TILTING, seen, freedom, Priors.none(TILTING, count))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from examples.worlds.alignment_scenes import Scene, grid, scene
+from examples.worlds.alignment_scenes import Scene, grid_scene
 from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.geometry.camera import Camera
@@ -38,8 +38,7 @@ def _cut(given: Scene, margins: list[tuple[int, int]]) -> tuple[list[Camera], li
 
 
 def test_cut_images_are_aligned_with_one_lens_in_pixels() -> None:
-    rng = np.random.default_rng(3)
-    given = scene(grid(3, 2, (0.3, 0.25), 0.1, rng), noise=0.1, outliers=0.0, rng=rng)
+    given = grid_scene(3, 2, (0.3, 0.25), 0.1, seed=3, noise=0.1, outliers=0.0)
     cameras, links = _cut(given, [(0, 0), (40, 10), (0, 30), (60, 0), (20, 20), (0, 0)])
     size = common_size(cameras, links)
     assert size == (640, 480)
@@ -62,8 +61,7 @@ def test_cut_images_are_aligned_with_one_lens_in_pixels() -> None:
 
 
 def test_smaller_copies_and_images_of_one_size_are_no_cut_outs() -> None:
-    rng = np.random.default_rng(4)
-    given = scene(grid(2, 2, (0.3, 0.25), 0.1, rng), rng=rng)
+    given = grid_scene(2, 2, (0.3, 0.25), 0.1, seed=4)
     assert common_size(given.cameras, given.links) is None
     small = Camera((320, 240))
     cameras = [small, *given.cameras[1:]]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from examples.worlds.alignment_scenes import Scene, grid, scene
+from examples.worlds.alignment_scenes import Scene, grid, grid_scene, scene
+from rdstitch.alignment.adjustment_problem import LinkProblem
 from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links, triangles
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
@@ -64,8 +65,7 @@ def test_a_link_far_worse_than_the_others_misfits() -> None:
 )
 def test_a_link_is_suspected_by_what_its_covariance_allows(shift: float, noise: float, suspected: bool) -> None:
     """One of the links of three by three images is off by a share of the half diagonal."""
-    rng = np.random.default_rng(4)
-    given = scene(grid(3, 3, (0.3, 0.25), 0.1, rng), noise=noise, outliers=0.0, per_link=40, rng=rng)
+    given = grid_scene(3, 3, (0.3, 0.25), 0.1, seed=4, noise=noise, outliers=0.0, per_link=40)
     wrong = next(k for k, link in enumerate(given.links) if (link.image1, link.image2) == (3, 4))
     link = given.links[wrong]
     moved = link.points2 + shift * given.cameras[0].scale * np.array([0.6, 0.8])
@@ -101,12 +101,11 @@ def _apart(given: Scene, links: list[Link]) -> tuple[BundleAdjustmentResult, Obs
     lens[0] = given.distortion
     relations = relations_at(observations, [link.relation for link in links], lens)
     known = AlignmentOptions().camera_priors(given.cameras)
-    return pairwise_homographies(observations, relations, lens, lens != 0.0, known), observations
+    return pairwise_homographies(LinkProblem(observations, relations, lens, lens != 0.0, known)), observations
 
 
 def test_a_fit_that_ran_away_is_suspected_and_says_nothing_of_others() -> None:
-    rng = np.random.default_rng(4)
-    given = scene(grid(3, 3, (0.3, 0.25), 0.1, rng), noise=0.3, outliers=0.0, per_link=40, rng=rng)
+    given = grid_scene(3, 3, (0.3, 0.25), 0.1, seed=4, noise=0.3, outliers=0.0, per_link=40)
     apart, observations = _apart(given, given.links)
     for lost in (np.zeros((3, 3)), np.outer([1e200, 1.0, 1.0], [1.0, 1e-3, 1.0]), np.full((3, 3), np.nan)):
         ran_away = replace(apart)

@@ -6,10 +6,9 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from examples.worlds.alignment_scenes import Scene, aligned, grid, jittered, scene
+from examples.worlds.alignment_scenes import Scene, aligned, grid, grid_scene, jittered, scene
 from rdstitch.alignment import AlignmentOptions, AlignmentTask, align
-from rdstitch.alignment.adjusted_images import AdjustedImages
-from rdstitch.alignment.build_result import build_alignment
+from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.motion_models import PSI, THETA
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
@@ -86,8 +85,7 @@ def test_attitudes_that_say_less_than_their_scatter_are_no_contradiction() -> No
 
 @pytest.mark.parametrize(("tilt", "right"), [((0.05, -0.03), True), ((-0.05, 0.03), False), ((0.05, 0.03), False)])
 def test_a_tilt_of_the_wrong_sign_is_not_used(tilt: tuple[float, float], right: bool) -> None:
-    rng = np.random.default_rng(5)
-    given = scene(grid(4, 3, (0.5, 0.4), 0.3, rng), tilt=(0.05, -0.03), rng=rng, per_link=80)
+    given = grid_scene(4, 3, (0.5, 0.4), 0.3, seed=5, tilt=(0.05, -0.03), per_link=80)
     found = aligned(given, lens="division", tilt=tilt)
     assert (found.messages == ()) == right
     assert found.tilt == pytest.approx((0.05, -0.03), abs=0.002)
@@ -95,8 +93,7 @@ def test_a_tilt_of_the_wrong_sign_is_not_used(tilt: tuple[float, float], right: 
 
 
 def test_a_turn_that_was_asked_for_is_taken_beside_a_given_tilt() -> None:
-    rng = np.random.default_rng(5)
-    given = scene(grid(2, 2, (0.4, 0.3), 0.2, rng), rng=rng, per_link=40)
+    given = grid_scene(2, 2, seed=5, per_link=40)
     assert aligned(given, model="rotation", tilt=(0.05, -0.03)).model == "rotation"
 
 
@@ -105,8 +102,7 @@ def test_a_turn_that_was_asked_for_is_taken_beside_a_given_tilt() -> None:
 )
 def test_a_focal_length_that_the_images_contradict_is_not_used(factor: float, right: bool, tilt_given: bool) -> None:
     tilt = (math.radians(8.0), math.radians(-5.0))
-    rng = np.random.default_rng(3)
-    given = scene(grid(4, 3, (0.4, 0.3), 0.25, rng), tilt=tilt, rng=rng, per_link=80)
+    given = grid_scene(4, 3, yaw=0.25, seed=3, tilt=tilt, per_link=80)
     true = given.cameras[0].with_focal().focal
     told = [camera.with_focal(factor * true, "option") for camera in given.cameras]
     alignment = align(told, given.links, AlignmentOptions(lens="division", tilt=tilt if tilt_given else None))
@@ -119,8 +115,7 @@ def test_a_focal_length_that_the_images_contradict_is_not_used(factor: float, ri
 
 
 def test_a_focal_length_stays_given_where_no_camera_is_possible_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(3)
-    given = scene(grid(4, 3, (0.4, 0.3), 0.25, rng), tilt=(0.14, -0.09), rng=rng, per_link=80)
+    given = grid_scene(4, 3, yaw=0.25, seed=3, tilt=(0.14, -0.09), per_link=80)
     told = [camera.with_focal(1.15 * camera.with_focal().focal, "option") for camera in given.cameras]
     recipe = import_module(AlignmentTask.__module__)
 
@@ -138,12 +133,11 @@ def test_a_focal_length_stays_given_where_no_camera_is_possible_without_it(monke
     ("sign", "named"), [(1.0, ["focal-contradicted"]), (-1.0, ["attitudes-contradicted", "focal-contradicted"])]
 )
 def test_beside_a_wrong_focal_length_attitudes_are_named_only_if_they_are_wrong(sign: float, named: list[str]) -> None:
-    rng = np.random.default_rng(2)
-    poses = jittered(grid(4, 3, (0.4, 0.3), 0.25, rng), 0.1, math.radians(6.0), rng)
-    given = scene(poses, focal_source="exif", rng=rng, per_link=80)
+    wind = 0.1, math.radians(6.0)
+    given = grid_scene(4, 3, yaw=0.25, seed=2, focal_source="exif", per_link=80, wind=wind)
     true = given.cameras[0].with_focal().focal
     told = [camera.with_focal(1.2 * true, "option") for camera in given.cameras]
-    attitudes = sign * poses[:, [PSI, THETA]]
+    attitudes = sign * given.poses[:, [PSI, THETA]]
     options = AlignmentOptions(lens="division", attitudes=attitudes, attitudes_std=math.radians(0.1))
     found = align(told, given.links, options)
     assert sorted(message.code for message in found.messages) == named

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from examples.worlds.alignment_scenes import Scene, aligned, grid, scene
+from examples.worlds.alignment_scenes import Scene, aligned, grid_scene
 from examples.worlds.lens_scenes import FISHEYE, SIZE, lens_distance, lens_scene
 from rdstitch.alignment import LENSES, Alignment, AlignmentOptions
-from rdstitch.alignment.least_squares.observations import Observations
+from rdstitch.alignment.adjustment_problem import LinkProblem
 from rdstitch.alignment.lens import lens_selection
 from rdstitch.alignment.lens.lens_description import describe_lens, radius_std
 from rdstitch.alignment.lens.lens_selection import LensChoice, free_parameters
@@ -63,9 +63,9 @@ def test_some_of_very_many_links_show_the_lens(monkeypatch: pytest.MonkeyPatch) 
     given, every = fisheye_alignment()
     sizes = []
 
-    def noted(seen: Observations, *others: Any) -> Any:
-        sizes.append(len(seen))
-        return pairwise_homographies(seen, *others)
+    def noted(links: LinkProblem) -> Any:
+        sizes.append(len(links.observations))
+        return pairwise_homographies(links)
 
     monkeypatch.setattr(lens_selection, "pairwise_homographies", noted)
     monkeypatch.setattr(lens_selection, "_ENOUGH_LINKS", len(given.links) // 2)
@@ -86,10 +86,10 @@ def test_a_centre_off_the_middle_is_found_alone() -> None:
 def test_a_pair_says_whether_it_shows_the_lens() -> None:
     messages = []
     for noise, per_link in ((0.05, 2000), (1.0, 60)):
-        rng = np.random.default_rng(0)
-        poses = grid(2, 1, (0.5, 0.35), 0.5, rng)
         lens = Camera(SIZE, -0.25)
-        given = scene(poses, lens=lens, rng=rng, noise=noise, focal=420.0, per_link=per_link, outliers=0.0)
+        given = grid_scene(
+            2, 1, (0.5, 0.35), 0.5, seed=0, lens=lens, noise=noise, focal=420.0, per_link=per_link, outliers=0.0
+        )
         found = aligned(given)
         assert found.lens == "division"
         messages.append([message for message in found.messages if message.code == "few-images"])
@@ -100,18 +100,15 @@ def test_a_pair_says_whether_it_shows_the_lens() -> None:
 
 
 def test_four_images_are_not_few() -> None:
-    rng = np.random.default_rng(0)
-    poses = grid(2, 2, (0.5, 0.35), 0.5, rng)
-    given = scene(poses, lens=Camera(SIZE, -0.25), rng=rng, noise=1.0, focal=420.0, per_link=40)
+    given = grid_scene(2, 2, (0.5, 0.35), 0.5, seed=0, lens=Camera(SIZE, -0.25), noise=1.0, focal=420.0, per_link=40)
     found = aligned(given, lens="division3")
     assert radius_std(found.cameras[0], np.linspace(0.05, 1.0, 20))[-1] > 0.5
     assert "few-images" not in [message.code for message in found.messages]
 
 
 def test_a_given_lens_is_not_doubted() -> None:
-    rng = np.random.default_rng(0)
     lens = Camera(SIZE, -0.25)
-    given = scene(grid(2, 1, (0.5, 0.35), 0.5, rng), lens=lens, rng=rng, noise=1.0, focal=420.0, per_link=60)
+    given = grid_scene(2, 1, (0.5, 0.35), 0.5, seed=0, lens=lens, noise=1.0, focal=420.0, per_link=60)
     cameras = [camera.with_coefficients(*lens.coefficients) for camera in given.cameras]
     assert not aligned(replace(given, cameras=cameras), lens_known=True).messages
 
@@ -152,8 +149,7 @@ def test_a_lens_that_is_requested_is_estimated(name: str) -> None:
 
 def test_a_pair_keeps_the_centre_in_the_middle_and_says_so() -> None:
     lens = replace(FISHEYE, center=(319.5, 239.5))
-    rng = np.random.default_rng(6)
-    given = scene(grid(2, 1, (0.35, 0.35), 0.5, rng), lens=lens, rng=rng, noise=0.1, per_link=400, focal=420.0)
+    given = grid_scene(2, 1, (0.35, 0.35), 0.5, seed=6, lens=lens, noise=0.1, per_link=400, focal=420.0)
     found = aligned(given)
     assert found.lens in ("division2", "division3")
     assert found.cameras[0].center == (319.5, 239.5)
@@ -218,8 +214,8 @@ def test_all_images_together_show_a_third_coefficient_that_pairs_do_not(monkeypa
     given = lens_scene(replace(FISHEYE, distortion2=-0.03, distortion3=-0.03), 0)
     chosen = []
 
-    def choose(seen: Observations, apart: Any, names: object, known: Any) -> LensChoice:
-        chosen.append(lens_selection.choose_lens(seen, apart, ["division", "division2"], known))
+    def choose(links: LinkProblem, apart: Any, names: object) -> LensChoice:
+        chosen.append(lens_selection.choose_lens(links, apart, ["division", "division2"]))
         return chosen[-1]
 
     monkeypatch.setattr(observability, "choose_lens", choose)
@@ -262,10 +258,10 @@ def test_a_third_coefficient_is_not_taken_from_relief() -> None:
 
 def pair(seed: int, *, distortion: float = 0.0, noise: float = 0.5, count: int = 80, depth: float = 0.0) -> Scene:
     """Two images; ``depth`` moves the matches of the second by so many pixels, together where they are neighbours."""
-    rng = np.random.default_rng(seed)
-    poses = grid(2, 1, (0.3, 0.3), 0.3, rng)
     lens = Camera(SIZE, distortion)
-    given = scene(poses, lens=lens, rng=rng, noise=noise, focal=420.0, per_link=count, outliers=0.0)
+    given = grid_scene(
+        2, 1, (0.3, 0.3), 0.3, seed=seed, lens=lens, noise=noise, focal=420.0, per_link=count, outliers=0.0
+    )
     (link,) = given.links
     places = lens.normalize(link.points1)
     moved = np.column_stack([np.sin(4.0 * places[:, 1]), 3.0 * (places**2).sum(axis=1) * places[:, 1]])

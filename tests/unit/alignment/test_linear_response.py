@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from examples.worlds.alignment_scenes import grid, scene
+from examples.worlds.alignment_scenes import grid_scene
 from rdstitch.alignment.least_squares.bundle_adjustment import (
     BundleAdjuster,
     BundleAdjustmentResult,
@@ -25,8 +25,7 @@ LENS = np.array([True, True, False, False, False])
 
 
 def _adjusted(model: MotionModel) -> tuple[BundleAdjuster, BundleAdjustmentResult]:
-    rng = np.random.default_rng(5)
-    truth = scene(grid(3, 2, (0.4, 0.35), 0.2, rng), rng=rng, per_link=60, outliers=0.0)
+    truth = grid_scene(3, 2, (0.4, 0.35), 0.2, seed=5, per_link=60, outliers=0.0)
     observations = Observations.from_links(truth.links, truth.cameras)
     shared = model.shared_from_physical(np.array([0.0, 0.0, np.log(1.3)])) if model.shared_names else np.zeros(0)
     poses = model.nearest_poses(truth.truth, shared, np.zeros((len(truth.truth), 2)))

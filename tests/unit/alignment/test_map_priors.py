@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 
-from examples.worlds.alignment_scenes import Scene, grid, jittered, scene
+from examples.worlds.alignment_scenes import Scene, grid, grid_scene, jittered
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.least_squares.plane_marks import PlaneMarks, Sighting
 from rdstitch.alignment.motion_models import TILTING, X, Y
@@ -19,8 +19,7 @@ _HEIGHT = 300.0
 @cache
 def _strip(relief: float) -> Scene:
     """Of 30 images: a shorter one keeps its shape without positions."""
-    rng = np.random.default_rng(1)
-    return scene(grid(30, 1, (0.4, 0.1), 0.1, rng), per_link=50, relief=relief, rng=rng, focal_source="exif", reach=2)
+    return grid_scene(30, 1, (0.4, 0.1), 0.1, seed=1, per_link=50, relief=relief, focal_source="exif", reach=2)
 
 
 def _positions(given: Scene, std: float) -> FloatArray:

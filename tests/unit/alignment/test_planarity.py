@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rdstitch.alignment.build_result import _relief_test
-from rdstitch.alignment.least_squares.link_equations import squared_lengths
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.noise import Coherence, coherence, evidence_of, shared_variance
 from rdstitch.alignment.noise import independent_errors as independent
+from rdstitch.alignment.sentences import relief_test
 from rdstitch.arrays import FloatArray
 from rdstitch.robust.posterior import MODEL_ERROR
 from tests.alignment_stubs import SHIFT, independent_errors, observations
@@ -35,7 +34,7 @@ def test_relief_needs_agreement_and_size(
     correlation: float, relative_size: float, model: str, links: int, found: bool, says: str
 ) -> None:
     for diagonal in (500.0, 2000.0):
-        relief = _relief_test(Coherence(correlation, relative_size * diagonal, relative_size), MODELS[model], links)
+        relief = relief_test(Coherence(correlation, relative_size * diagonal, relative_size), MODELS[model], links)
         assert (relief.found, says in relief.explanation) == (found, True)
 
 
@@ -131,10 +130,6 @@ def test_links_measure_points_again_and_only_inliers_of_links_that_fit_count() -
 
 def test_there_are_two_observations_at_least() -> None:
     assert _found(np.full((1, 1, 2), 0.3), 2)[1] == 2.0
-
-
-def test_what_cannot_be_transferred_is_infinitely_off() -> None:
-    assert squared_lengths(np.array([[3.0, 4.0], [np.nan, 1.0]])).tolist() == [25.0, np.inf]
 
 
 @pytest.mark.parametrize(("sigma", "noise"), [(0.5, 0.5), (0.01, MODEL_ERROR)])

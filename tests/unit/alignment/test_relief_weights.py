@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from examples.worlds.alignment_scenes import Scene, aligned, fitted, grid, scene
+from examples.worlds.alignment_scenes import Scene, aligned, fitted, grid_scene
 from rdstitch.alignment.motion_models import SIMILARITY
 from rdstitch.alignment.recipe import from_another_start
 from rdstitch.alignment.relief_weights import choose_over_relief, weighted_by_relief
@@ -15,8 +15,7 @@ from rdstitch.geometry.radial_homography import measurement_whitening
 
 
 def _scene(relief: float, seed: int = 0) -> Scene:
-    rng = np.random.default_rng(seed)
-    return scene(grid(3, 2, (0.4, 0.3), 0.2, rng), rng=rng, relief=relief)
+    return grid_scene(3, 2, seed=seed, relief=relief)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from examples.worlds.alignment_scenes import aligned, fitted, grid, scene
+from examples.worlds.alignment_scenes import aligned, fitted, grid, grid_scene, scene
 from examples.worlds.lens_scenes import SIZE, lens_scene
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters
 from rdstitch.alignment.least_squares.linear_response import LinearResponse
@@ -81,8 +81,7 @@ def test_the_deviation_is_the_scatter(shared_keypoints: bool) -> None:
 def test_the_stated_deviation_covers_relief(relief: float) -> None:
     misses = []
     for seed in range(16):
-        rng = np.random.default_rng(seed)
-        given = scene(grid(3, 2, (0.4, 0.3), 0.2, rng), rng=rng, relief=relief)
+        given = grid_scene(3, 2, seed=seed, relief=relief)
         found = aligned(given, model="similarity")
         misses.append(abs(found.distortion - given.distortion) / found.distortion_std)
     assert max(misses) < 3.0
@@ -102,8 +101,7 @@ def test_the_stated_deviation_covers_what_two_images_do_not_show() -> None:
 
 def _variance_by_relief(columns: int, rows: int, lens: Camera | None, matches: int, seed: int) -> float:
     """Of λ, over its variance by independent errors, with all of the lens free over a plane fitted with λ alone."""
-    rng = np.random.default_rng(seed)
-    given = scene(grid(columns, rows, (0.5, 0.3), 0.2, rng), rng=rng, per_link=matches, lens=lens)
+    given = grid_scene(columns, rows, (0.5, 0.3), 0.2, seed=seed, per_link=matches, lens=lens)
     problem, fit = fitted(given)
     adjuster = replace(problem, free_lens=np.ones_like(problem.free_lens)).adjuster_of(fit)
     steps, of_lens = ReliefField(LinearResponse.of(adjuster, fit.adjusted)).steps()[1], len(fit.model.shared_names)

@@ -3,14 +3,13 @@
 import tempfile
 import tracemalloc
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from errno import ENOSPC
 from functools import partial
 from pathlib import Path
 from threading import Event, Timer
-from time import monotonic, sleep
 from typing import Any
 
 import cv2
@@ -110,13 +109,6 @@ def test_what_is_not_expected_makes_room_and_is_read_once_more_if_need_be() -> N
     assert decoded_images.reads == {0: 2, 1: 1, 2: 1}
 
 
-def _until(told: Callable[[], bool]) -> None:
-    end = monotonic() + 30.0
-    while not told():
-        assert monotonic() < end
-        sleep(0.001)
-
-
 def test_images_can_be_had_while_another_one_goes_to_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     decoded_images, writing, go_on = DecodedImageCache(), Event(), Event()
     cache = decoded_images.cache(limit=40_000)
@@ -212,7 +204,8 @@ def test_a_failed_prefetch_raises_where_the_image_is_read() -> None:
     cache = decoded_images.cache(limit=80_000, ahead=True)
     decoded_images.frames[1] = decoded_images.frames[1][:50]
     cache.prefetch([1, 2])
-    _until(lambda: decoded_images.reads[2] == 1)
+    wait_for_all_read_ahead(cache)
+    assert decoded_images.reads[2] == 1
     with pytest.raises(InputError, match="image 2 has 200 x 50 pixels"):
         cache.get(1)
 

@@ -17,9 +17,9 @@ from rdstitch.errors import ArgumentError
 from rdstitch.features import FeatureOptions, Features, PackedFeatures, View, detect, detect_view, match
 from rdstitch.features.crossings import find_crossings
 from rdstitch.features.detect import spread, strongest
-from rdstitch.features.opencv import OpenCVDetection
+from rdstitch.features.opencv import detect_opencv
 from rdstitch.features.prepared_image import common_stretch, halving, prepare, usual_stretch
-from rdstitch.features.sift_tiles import SiftTilesDetection
+from rdstitch.features.sift_tiles import detect_sift_in_tiles
 from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic import ImageTexture, Photometry, grid_poses, ground, sequence_over
 from tests.cli.running import flight
@@ -269,7 +269,7 @@ def grey() -> NDArray[np.uint8]:
 
 def test_keypoints_of_tiles_are_those_of_the_whole(grey: NDArray[np.uint8]) -> None:
     """No fine one is lost, or found twice, where tiles meet; and each is described as in the whole."""
-    whole, tiles = OpenCVDetection.find(grey, OPTIONS), SiftTilesDetection.find(grey, OPTIONS)
+    whole, tiles = detect_opencv(grey, OPTIONS), detect_sift_in_tiles(grey, OPTIONS)
     fine, small = (np.flatnonzero(found.scale < 6.5) for found in (whole, tiles))
     assert len(fine) == len(small) > 3000
     distance, partner = map(np.asarray, cKDTree(tiles.points[small]).query(whole.points[fine]))
@@ -330,9 +330,9 @@ def test_what_is_masked_or_shows_nothing_has_none() -> None:
 
 
 @pytest.mark.parametrize(("kind", "bytes_each"), [("rootsift", (1, 2)), ("sift", (1,)), ("orb", (1,)), ("surf", (2,))])
-def test_packed_features_match_as_before(kind: FeatureName, bytes_each: tuple[int, ...]) -> None:
-    colour = ground((320, 240), 11, 1).region(0, 0, 320, 240)
-    image = np.rint(cv2.GaussianBlur(colour, (0, 0), 1.0).reshape(240, 320) * 255).astype(np.uint8)
+def test_packed_features_match_as_before(
+    kind: FeatureName, bytes_each: tuple[int, ...], image: NDArray[np.uint8]
+) -> None:
     options = FeatureOptions(kind=kind, max_features=500)
     features = [detect(image, options), detect(np.ascontiguousarray(image[:, 40:]), options)]
     packed = [PackedFeatures.pack(found) for found in features]

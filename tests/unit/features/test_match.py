@@ -246,14 +246,8 @@ def images() -> tuple[Features, Features]:
 
 
 def _some(found: Correspondences, count: int) -> Correspondences:
-    """Every so-manieth match."""
-    kept = np.linspace(0, len(found) - 1, count).astype(np.intp)
-    return Correspondences(found.indices[kept], found.points1[kept], found.points2[kept], found.ratio[kept])
-
-
-def _joined(*found: Correspondences) -> Correspondences:
-    names = ("indices", "points1", "points2", "ratio")
-    return Correspondences(*(np.concatenate([getattr(one, name) for one in found]) for name in names))
+    """Every n-th match."""
+    return found.take(np.linspace(0, len(found) - 1, count).astype(np.intp))
 
 
 def _chance(features1: Features, features2: Features, count: int) -> Correspondences:
@@ -276,9 +270,9 @@ def test_matches_in_the_overlap_are_those_of_the_whole_of_half_the_features(imag
 
 def test_a_few_matches_by_chance_do_not_widen_it_and_many_tell_nothing(images: tuple[Features, Features]) -> None:
     some = _some(match(*images), 80)
-    assert overlapping(*images, _joined(some, _chance(*images, 30))) is None
-    alone, beside = overlapping(*images, some), overlapping(*images, _joined(some, _chance(*images, 6)))
-    for clean, disturbed in zip(alone, beside, strict=True):
+    many, few = (Correspondences.concatenate([some, _chance(*images, count)]) for count in (30, 6))
+    assert overlapping(*images, many) is None
+    for clean, disturbed in zip(overlapping(*images, some), overlapping(*images, few), strict=True):
         assert len(np.setdiff1d(disturbed, clean)) < 0.1 * len(clean)
 
 

@@ -2,11 +2,11 @@
 
 import re
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.errors import ArgumentError, InputError
@@ -184,19 +184,11 @@ def test_damaged_images_are_none_or_what_is_left_without_a_word(capfd: pytest.Ca
 def test_frames_that_cannot_be_decoded_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clip = video(tmp_path / "clip.avi")
 
-    class Faulty:
-        """A capture that does not decode the second frame."""
+    def capture(number: int) -> Mock:
+        decoded = (True, np.zeros((48, 64, 3), np.uint8)) if number != 1 else (False, None)
+        return Mock(get={cv2.CAP_PROP_FRAME_COUNT: 3.0, cv2.CAP_PROP_FPS: 25.0}.get, retrieve=lambda: decoded)
 
-        def get(self, what: int) -> float:
-            return {cv2.CAP_PROP_FRAME_COUNT: 3.0, cv2.CAP_PROP_FPS: 25.0}[what]
-
-        def __init__(self, number: int) -> None:
-            self.number = number
-
-        def retrieve(self) -> tuple[bool, NDArray[np.uint8] | None]:
-            return (True, np.zeros((48, 64, 3), np.uint8)) if self.number != 1 else (False, None)
-
-    monkeypatch.setattr(video_reader, "grabbed_frames", lambda path: ((k, k / 25.0, Faulty(k)) for k in range(3)))
+    monkeypatch.setattr(video_reader, "grabbed_frames", lambda path: ((k, k / 25.0, capture(k)) for k in range(3)))
     found = find_images([clip], frames_folder=lambda: tmp_path, every=1)
     assert len(found.frames) == 2
     assert [message.text for message in found.messages] == ["1 frame cannot be decoded and is left out"]

@@ -114,7 +114,7 @@ def test_a_row_is_about_the_image_whose_path_ends_like_its_name(
 
 
 def test_names_in_lists_hold_blanks() -> None:
-    rows = listed_rows(["DJI 0001 (2).jpg 12.5 48 -3", "# no", "", "b.jpg 1 2"], "geo.txt", ("name", "x", "y"), 2)
+    rows = listed_rows("DJI 0001 (2).jpg 12.5 48 -3\n# no\n\nb.jpg 1 2", "geo.txt", ("name", "x", "y"), 2)
     assert [(row.image, row.number("x"), row.number("y")) for row in rows] == [
         ("DJI 0001 (2).jpg", 12.5, 48.0),
         ("b.jpg", 1.0, 2.0),

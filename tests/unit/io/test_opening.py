@@ -23,6 +23,7 @@ from rdstitch.io import read as reading
 from rdstitch.io import read_image, read_jpeg, read_metadata, write_image
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.io.metadata import MAX_PROFILE
+from rdstitch.io.opening import MAX_IMAGE_GB
 from rdstitch.system.file_access import open_regular, read_beginning, read_limited, read_text
 
 _RGB = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
@@ -202,14 +203,23 @@ def test_of_an_image_in_two_formats_the_usual_one_is_taken(tmp_path: Path) -> No
     assert others.endswith("not taken for images: notes.txt")
 
 
-def test_the_limit_of_memory_knows_channels_and_depth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "a.png").write_bytes(cv2.imencode(".png", np.zeros((100, 100, 4), np.uint16))[1].tobytes())
-    monkeypatch.setenv("RDSTITCH_MAX_IMAGE_GB", "7e-5")
-    for read in (read_metadata, read_image):
-        with pytest.raises(InputError, match="100 x 100 pixels take"):
-            read(tmp_path / "a.png")
-    monkeypatch.setenv("RDSTITCH_MAX_IMAGE_GB", "9e-5")
-    assert read_image(tmp_path / "a.png").pixels.dtype == np.uint16
+@pytest.mark.parametrize(("name", "shape"), [("a.png", (100, 100, 4)), ("a.tif", (60, 100, 200))])
+def test_the_limit_of_memory_knows_channels_and_depth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, shape: tuple[int, int, int]
+) -> None:
+    """By the header alone; the limit can be raised."""
+    file, samples = tmp_path / name, np.zeros(shape, np.uint16)
+    if file.suffix == ".png":
+        file.write_bytes(cv2.imencode(".png", samples)[1].tobytes())
+    else:
+        tifffile.imwrite(file, samples, planarconfig="contig", photometric="minisblack")
+    for factor, message in ((0.9, f"100 x {shape[0]} pixels take .* set {MAX_IMAGE_GB}"), (None, "expected a number")):
+        monkeypatch.setenv(MAX_IMAGE_GB, "much" if factor is None else str(factor * samples.nbytes / 1e9))
+        for read in (read_metadata, read_image):
+            with pytest.raises(InputError, match=message):
+                read(file)
+    monkeypatch.setenv(MAX_IMAGE_GB, str(1.1 * samples.nbytes / 1e9))
+    assert read_image(file).pixels.dtype == np.uint16
 
 
 def _dng(file: Path) -> Path:

@@ -9,10 +9,8 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import inverse, turned
 from rdstitch.io import read_image, read_metadata
-from rdstitch.io.opening import MAX_IMAGE_GB
 
 Samples = NDArray[Any]
 H, W = 20, 30
@@ -164,20 +162,6 @@ def test_few_bits_fill_the_range_and_palettes_are_colours(tmp_path: Path) -> Non
         data[offset : offset + 8] = packed
     (tmp_path / "four.tif").write_bytes(data)
     np.testing.assert_array_equal(read_image(tmp_path / "four.tif").pixels, levels * 17)
-
-
-def test_bands_count_against_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the header alone; the limit can be raised."""
-    file = tmp_path / "many.tif"
-    tifffile.imwrite(file, np.zeros((60, 100, 200), np.uint16), planarconfig="contig", photometric="minisblack")
-    monkeypatch.setenv(MAX_IMAGE_GB, "0.002")
-    with pytest.raises(InputError, match=rf"many\.tif: 100 x 60 pixels .* set {MAX_IMAGE_GB}"):
-        read_metadata(file)
-    monkeypatch.setenv(MAX_IMAGE_GB, "0.003")
-    assert read_image(file).pixels.shape == (60, 100, 200)
-    monkeypatch.setenv(MAX_IMAGE_GB, "much")
-    with pytest.raises(InputError, match=f"{MAX_IMAGE_GB}=much: expected a number"):
-        read_metadata(file)
 
 
 def test_the_header_of_the_first_page_is_read_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -93,11 +93,16 @@ def test_strips_do_not_matter(tmp_path_factory: pytest.TempPathFactory, suffix: 
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "ome.tif", "webp"])
-def test_same_bytes_twice(tmp_path: Path, suffix: str) -> None:
-    pixels = _image(700, 400, 3, np.uint8)
-    for name in ("a", "b"):
-        write_image(tmp_path / f"{name}.{suffix}", pixels)
-    assert (tmp_path / f"a.{suffix}").read_bytes() == (tmp_path / f"b.{suffix}").read_bytes()
+def test_same_bytes_every_time(tmp_path: Path, suffix: str) -> None:
+    pixels, written = _image(600, 700, 3, np.uint8), set()
+    alpha = np.full(pixels.shape[:2], 255, np.uint8)
+    alpha[:90], alpha[:, 640:] = 0, 0
+    for write in range(8):
+        write_image(tmp_path / f"a.{suffix}", pixels, alpha)
+        written.add((tmp_path / f"a.{suffix}").read_bytes())
+        # Whatever the compressor finds in memory must not matter.
+        np.random.default_rng(write).bytes(300_000 + 10_000 * write)
+    assert len(written) == 1
 
 
 def test_other_images_have_another_identity(tmp_path: Path) -> None:
@@ -136,20 +141,6 @@ def test_tiff_has_overviews_of_half_the_size(tmp_path: Path) -> None:
     expected = pixels[200:1300, :1002].astype(float).reshape(550, 2, 501, 2, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(half[100:650, :501, :3], expected, atol=0.51)
     assert (half[:100, :, 3] == 0).all()
-
-
-@pytest.mark.parametrize("writes", [8, pytest.param(200, marks=pytest.mark.slow)])
-def test_tiff_has_the_same_bytes_every_time(tmp_path: Path, writes: int) -> None:
-    pixels = _image(600, 700, 3, np.uint8)
-    alpha = np.full(pixels.shape[:2], 255, np.uint8)
-    alpha[:90], alpha[:, 640:] = 0, 0
-    written = set()
-    for write in range(writes):
-        write_image(tmp_path / "a.tif", pixels, alpha)
-        written.add((tmp_path / "a.tif").read_bytes())
-        # Whatever the compressor finds in memory must not matter.
-        np.random.default_rng(write).bytes(300_000 + 10_000 * write)
-    assert len(written) == 1
 
 
 def test_every_format_has_its_limits() -> None:
@@ -251,7 +242,7 @@ def test_tiff_is_cloud_optimized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     alpha = np.full(pixels.shape[:2], 255, np.uint8)
     alpha[:130] = 0
     exif = Image.Exif()
-    exif[ExifTags.Base.Make] = "Maker of cameras"
+    exif[ExifTags.Base.Make] = "Maker of cameras\0\0\0"  # as cameras pad it
     write_image(tmp_path / "a.tif", pixels, alpha, Metadata((1100, 700), exif=exif.tobytes(), dpi=(300.0, 300.0)))
     with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
         pages = list(tiff.pages)
@@ -265,6 +256,7 @@ def test_tiff_is_cloud_optimized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         assert at[-1] < first[-1]
         assert all(offset % 2 == 0 for page in pages for offset in (page.offset, *page.dataoffsets))
         tags = tiff.pages.first.tags
+        assert tags["Make"].count == len("Maker of cameras\0")
         assert (tags["Make"].value, tags["XResolution"].value) == ("Maker of cameras", (300, 1))
         np.testing.assert_array_equal(
             tiff.asarray()[..., :channels] if channels > 1 else tiff.asarray(), pixels.squeeze()
@@ -276,18 +268,6 @@ def test_tiff_is_cloud_optimized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert [path.name for path in tmp_path.iterdir()] == ["a.tif"]
     cogeo = pytest.importorskip("rio_cogeo.cogeo")
     assert cogeo.cog_validate(tmp_path / "a.tif", quiet=True) == (True, [], [])
-
-
-def test_padding_of_camera_names_is_not_copied(tmp_path: Path) -> None:
-    exif = Image.Exif()
-    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Maker\0\0\0", "Camera 1\0"
-    metadata = Metadata((8, 8), exif=exif.tobytes())
-    write_image(tmp_path / "a.tif", np.zeros((8, 8), np.uint8), metadata=metadata)
-    with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
-        tags = tiff.pages.first.tags
-        assert (tags["Make"].value, tags["Model"].value) == ("Maker", "Camera 1")
-    data = (tmp_path / "a.tif").read_bytes()
-    assert b"Maker\0\0" not in data
 
 
 @pytest.mark.parametrize("dpi", [(4294967295 * 2.54,) * 2, (-72.0, -72.0), (1e-12, 72.0)])

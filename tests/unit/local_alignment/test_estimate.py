@@ -23,7 +23,7 @@ from rdstitch.local_alignment.field import grid_shape, node_points
 from rdstitch.local_alignment.fit import Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches, place_matches
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.pipeline.align_locally import align_registration_locally
+from rdstitch.pipeline.lay_out import align_registration_locally
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
 from tests.registrations import registration
 
@@ -133,6 +133,11 @@ def matches(sequence: Sequence, noise: float = 0.2, wrong: float = 0.0, count: i
     return found
 
 
+def off_and_on(sequence: Sequence, matrices: FloatArray, local: LocalAlignment) -> tuple[FloatArray, FloatArray]:
+    """How far images are apart without and with local alignment."""
+    return displacements(sequence, matrices, replace(local, fields=())), displacements(sequence, matrices, local)
+
+
 def displacements(sequence: Sequence, matrices: FloatArray, local: LocalAlignment) -> FloatArray:
     """How far two images are apart on the ground, texels, where both show the same place of the output."""
     rng = np.random.default_rng(4)
@@ -157,7 +162,7 @@ def test_what_relief_moves_apart_comes_together(kind: str, height: float, wrong:
     matrices = homographies(sequence)
     local = align_locally(matches(sequence, wrong=wrong), CAMERAS, matrices)
     assert local.after.median < 0.5 * local.before.median
-    off, on = (displacements(sequence, matrices, which) for which in (replace(local, fields=()), local))
+    off, on = off_and_on(sequence, matrices, local)
     assert np.median(on) < 0.3 * np.median(off)
     assert np.percentile(on, 95) < 0.15 * np.percentile(off, 95)
     assert max(field.steepest for field in local.fields) <= 0.5
@@ -189,7 +194,7 @@ def test_what_lies_far_off_the_plane_is_reached(level: float) -> None:
     sequence = scene("slopes", 0.1)
     matrices = homographies(sequence, level)
     local = align_locally(matches(sequence, wrong=0.1), CAMERAS, matrices)
-    off, on = (displacements(sequence, matrices, which) for which in (replace(local, fields=()), local))
+    off, on = off_and_on(sequence, matrices, local)
     assert np.percentile(off, 95) > 30.0
     assert np.percentile(on, 95) < 3.0
 
@@ -330,7 +335,7 @@ def test_of_very_many_matches_an_even_part_is_enough(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("rdstitch.local_alignment.estimate._MAX_MATCHES", sum(len(m.points1) for m in found) // 4)
     part = align_locally(found, CAMERAS, matrices)
     assert not np.array_equal(part.fields[0].values, every.fields[0].values)
-    off, on = (displacements(sequence, matrices, which) for which in (replace(part, fields=()), part))
+    off, on = off_and_on(sequence, matrices, part)
     assert np.percentile(on, 95) < 0.5 * np.percentile(off, 95)
 
 
@@ -380,7 +385,7 @@ def test_what_a_turn_off_the_spot_moves_apart_comes_together() -> None:
     for match, (first, second) in zip(found, exact, strict=True):
         for mended, lengths in apart.items():
             expected = [
-                surface.to_surface(k, _expected(local, k, points) if mended else points)
+                surface.to_surface(k, local.fields[k].expected(points) if mended else points)
                 for k, points in ((match.image1, first), (match.image2, second))
             ]
             lengths.append(np.linalg.norm(expected[0] - expected[1], axis=1))
@@ -391,14 +396,6 @@ def test_what_a_turn_off_the_spot_moves_apart_comes_together() -> None:
     # A turn on the spot is left alone.
     found, matrices, _ = turn(0.0)
     assert align_locally(found, CAMERAS[:4], matrices, on_sphere=True).fields == ()
-
-
-def _expected(local: LocalAlignment, image: int, points: FloatArray) -> FloatArray:
-    """Pixels at which the alignment expects what is at measured ones."""
-    expected = points
-    for _ in range(20):
-        expected = points - local.fields[image](expected)
-    return expected
 
 
 def test_registered_turns_are_aligned_locally() -> None:

@@ -42,7 +42,7 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
         alignment=replace(found.alignment, links=links, used=found.alignment.used & [False, True, True]),
         messages=(left_out(frames[0], "contradicts"),),
     )
-    rest = without(spoiled, {(2,): Message("shows something else")}, Aligner.of(found.sources, OPTIONS, NO_CACHE))
+    rest = without(spoiled, {(2,): "shows something else"}, Aligner.of(found.sources, OPTIONS, NO_CACHE))
     assert rest.alignment.used.tolist() == [True, True, False]
     assert [str(message) for message in rest.left_out] == [f"left out {frames[2]}: shows something else [left-out]"]
 

@@ -28,7 +28,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, ground, sequence_over
-from rdstitch.tracking import FrameTracker, TrackingOptions
+from rdstitch.tracking import FrameTracker
 
 HEIGHT = 0.8
 
@@ -210,7 +210,8 @@ def test_after_a_jump_it_finds_its_place_in_the_map(drive: Sequence) -> None:
         assert np.linalg.norm(np.subtract(poses[number].position, poses[shown].position)) < 0.005 * HEIGHT
 
 
-@pytest.mark.parametrize("error", [ImpossibleCameraError, LimitError])  # the latter where its worker was killed
+# LimitError where its worker was killed, RuntimeError of a singular matrix.
+@pytest.mark.parametrize("error", [ImpossibleCameraError, LimitError, RuntimeError])
 def test_an_alignment_that_fails_is_survived(
     error: type[Exception], drive: Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -219,8 +220,8 @@ def test_an_alignment_that_fails_is_survived(
 
     monkeypatch.setattr("rdstitch.tracking.map_refinement.align", fails)
     monkeypatch.setattr("rdstitch.tracking.map_refinement._DELAY", 1)
-    options = TrackingOptions(EstimationOptions(distortion=DISTORTION), AlignmentOptions(tilt=TILT, lens_known=True))
-    tracker = FrameTracker(options, lambda image: detect(image.grey), match, ThreadPoolExecutor(1))
+    known = EstimationOptions(distortion=DISTORTION), AlignmentOptions(tilt=TILT, lens_known=True)
+    tracker = FrameTracker(*known, lambda image: detect(image.grey), match, ThreadPoolExecutor(1))
     for image in drive.frames():
         *_, last = tracker.add(prepare(View(image), None), CAMERA)
     assert last.pose is not None

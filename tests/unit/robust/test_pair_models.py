@@ -40,11 +40,3 @@ def test_known_tilts_are_kept() -> None:
     state = model.initialize(h[None], TILTS)
     np.testing.assert_allclose(model.homography(state)[0], h, atol=1e-12)
     assert model.motion(state[0]).height == pytest.approx(0.9)
-
-
-def test_the_prior_pulls_the_focal_length_back() -> None:
-    model = PlanarPairModel(1.3, 0.2)
-    state = model.retract(model.initialize(H[None]), np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.1]]))
-    residual, derivative = model.prior(state)
-    assert residual == pytest.approx(np.array([[0.5]]))
-    np.testing.assert_allclose(derivative, [[0, 0, 0, 0, 0, 5.0]])

@@ -11,7 +11,7 @@ from rdstitch.robust.covariance import covariances
 from rdstitch.robust.loss import robust_cost
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
-from rdstitch.robust.refinement import Fits, PairProblems, refine_pairs
+from rdstitch.robust.refinement import PairProblems, refine_pairs
 
 LENS = Camera((640, 480))
 FOCAL = 1.3
@@ -75,16 +75,16 @@ def test_it_comes_to_the_truth(model: PairModel, fixed: bool) -> None:
     shift = np.eye(3)
     shift[0, 2] = 0.01
     near = shift @ H
-    start = Fits(model.initialize(near[None]), near[None], np.array([DISTORTION if fixed else -0.15]))
     problems = _problems(model, noise=0.02, fixed=fixed)
-    found, equations = refine_pairs(problems, start, 30)
-    assert found.distortion == pytest.approx(DISTORTION, abs=1e-4)
-    seen = problems.normal_equations(found.parameters)
+    start = np.array([DISTORTION if fixed else -0.15])
+    found, equations = refine_pairs(problems, near[None], start, None, 30)
+    assert found[0, 0] == pytest.approx(DISTORTION, abs=1e-4)
+    seen = problems.normal_equations(found)
     np.testing.assert_array_equal(seen.errors, equations.errors)
     np.testing.assert_array_equal(seen.information, equations.information)
     assert seen.errors[0, :80].max() < 0.02
     assert np.isinf(seen.errors[0, 80:]).all()
-    assert problems.covariances(found.parameters, seen).shape == seen.information.shape
+    assert problems.covariances(found, seen).shape == seen.information.shape
 
 
 CAMERA = Camera((600, 800))  # half a diagonal of 500 pixels: cells of 100

@@ -9,7 +9,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import transfer
 from rdstitch.robust import estimate_radial_homography
-from rdstitch.robust.chance import MIN_OCCUPIED_CELLS, binomial_tail, occupied_cells, rejection_reason
+from rdstitch.robust.chance import MIN_OCCUPIED_CELLS, occupied_cells, rejection_reason
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.solvers.solutions import Solutions
@@ -166,15 +166,6 @@ def test_places_are_those_of_the_image_with_fewer() -> None:
     assert occupied_cells(_apart(30), _apart(30), SIZE, SIZE) == 30
     assert occupied_cells(_apart(30), np.full((30, 2), 7.0), SIZE, SIZE) == 1
     assert occupied_cells(_apart(30)[:0], _apart(30)[:0], SIZE, SIZE) == 0
-
-
-@pytest.mark.parametrize(
-    ("least", "trials", "probability"), [(0, 5, 0.3), (3, 3, 0.2), (40, 4000, 0.011), (2500, 4000, 0.6)]
-)
-def test_the_tail_is_that_of_the_binomial_distribution(least: int, trials: int, probability: float) -> None:
-    assert binomial_tail(least, trials, probability) == pytest.approx(
-        binom.sf(least - 1, trials, probability), rel=1e-9
-    )
 
 
 @pytest.mark.parametrize("small_first", [True, False])

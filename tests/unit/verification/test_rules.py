@@ -40,6 +40,7 @@ def _depth(alike: float, purpose: Purpose = Purpose.TRAJECTORY, size: float = 0.
         (_depth(0.1, model="rotation"), [Kind.DEPTH_OF_A_TURN]),
         (_depth(0.8), [Kind.RELIEF]),
         (_depth(0.8, parameters=()), [Kind.FREE_HOMOGRAPHIES]),  # one line: the plane may be none
+        (_depth(0.8, Purpose.CALIBRATE, parameters=()), [Kind.RELIEF]),  # of a lens nothing adds up
         (_depth(0.1, Purpose.MOSAIC, model="rotation", rms=4.0), []),
         # What local alignment hides along the seams of a plane leaves the whole bent.
         (_depth(0.8, Purpose.MOSAIC, rms=4.0), [Kind.ROUGH]),
@@ -136,6 +137,20 @@ def test_poses_by_what_fills_less_than_half_of_the_images_are_none(
     link = replace(_checked(0.1, (0, 1), unique=False), agreement=Agreement(80, 8, 100, coarsely))
     found = rules.found(rules.OF_THE_WHOLE, evidence(registration(), purpose, checked=[link]))
     assert [finding.severity for finding in found if finding.kind is Kind.RIVAL_MOTION] == severity
+
+
+@pytest.mark.parametrize(
+    ("purpose", "share", "placed"),
+    [(Purpose.MOSAIC, 0.15, True), (Purpose.MOSAIC, 0.05, False), (Purpose.TRAJECTORY, 0.15, False)],
+)
+def test_matches_of_a_picture_may_disagree_where_it_is_more_alike_than_by_chance(
+    purpose: Purpose, share: float, placed: bool
+) -> None:
+    """Depth, or what moved: seams go round it, or are told of; poses have nothing but their matches."""
+    given = registration(2, links=(LinkFit(0, 1, 100, 40, 0.5, True),), keypoints=(900, 900))
+    link = replace(_checked(share, (0, 1), unique=False), agreement=Agreement(100, round(100 * share), 100, 0.6))
+    found = evidence(given, purpose, checked=[link])
+    assert bool(failures_of_matches(found)) is not placed
 
 
 def _misfits(count: int, *, agree: float = 0.2, keypoints: tuple[int, ...] = (900, 900, 900)) -> list[Message]:
