@@ -92,6 +92,8 @@ def _lens_and_model(given: GivenImages) -> AdjustedImages:
     all_matches, relations = _observations(given.links, given.cameras, _matches_of_a_link(len(given.links), options))
     sample = all_matches.thinned(int(np.clip(_MATCHES_FOR_SELECTION // len(given.links), 40, 150)))
     lens = choose_observable_lens(given, sample, relations, known)
+    distortion = float(lens.pairwise.parameters.lens[0])
+    known = known.with_lens(distortion)
     wrong, confirmed = cycle_consistency(lens.pairwise, sample, len(given.cameras))
     all_links = _problem_of_all_links(given, sample, lens, _tree_ranks(sample, confirmed), known, wrong)
     problem, images = all_links.part(~wrong)
@@ -101,7 +103,7 @@ def _lens_and_model(given: GivenImages) -> AdjustedImages:
     while (contradiction := check_attitudes(problem, options)) is not None:
         options, message = contradiction
         messages.append(message)
-        all_links = replace(all_links, camera_priors=options.camera_priors(given.cameras))
+        all_links = replace(all_links, camera_priors=options.camera_priors(given.cameras).with_lens(distortion))
         problem, _ = all_links.part(~wrong)
     choice = select_model(problem, options.models, lens.refinements, options.purpose)
     choice, images, wrong = _drop_wrong_pairs(all_links, images, choice, wrong)

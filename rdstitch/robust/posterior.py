@@ -28,7 +28,8 @@ parameter               core; tail (weight)          source
                                                      lenses stays below 0.05
 μ, ν, distortion centre 0 ± 0.1, 0.03, 0.03          fisheye projections as series; tolerances of assembly
 log f, guessed          1.2 ± 30 %; 1.5 ± 70 % (0.1) half diagonals: phones, drones and compact cameras; from
-                                                     fisheyes to long lenses
+                                                     fisheyes to long lenses. Of strong barrel distortion what a
+                                                     fisheye of such λ has instead of 1.2
 log f, from EXIF        ± 5 %; as guessed (0.1)      rounded to a millimetre, mostly right; wrong by any factor
                                                      where a program has resized the image
 log f, given            ± 1 %, or as stated; live,   the user, or a camera file; of another lens, another zoom or

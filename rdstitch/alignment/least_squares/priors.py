@@ -15,6 +15,9 @@ from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.robust.posterior import LENS, TILT, Prior, exact, focal_prior
 
+_MOST_BARREL = 0.375
+"""-λ of an equisolid fisheye with the focal length as the unit; that of a stereographic one is 1/4."""
+
 
 @dataclass(frozen=True, eq=False)
 class Priors:
@@ -75,6 +78,12 @@ class CameraPriors:
             columns = [free.index(column) for column in (X, Y)]
             poses[:, columns], precision[:, columns] = self.places, self.places_precision[:, None]
         return replace(known, poses=poses, poses_precision=precision, marks=self.marks)
+
+    def with_lens(self, distortion: float) -> Self:
+        """With a focal length that was guessed no longer than that of a fisheye with this λ, in half diagonals."""
+        if self.focal_source != "guess" or distortion >= 0.0:
+            return self
+        return replace(self, log_focal=min(self.log_focal, math.log(_MOST_BARREL / -distortion) / 2.0))
 
     def of_camera(self, model: MotionModel, count: int) -> Priors:
         """For ``count`` images, nothing on their poses."""

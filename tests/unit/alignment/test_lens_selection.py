@@ -1,6 +1,7 @@
 """The ladder of lenses: as simple as the images allow, never taken in by relief, near what lenses usually have."""
 
 import importlib
+import math
 import re
 from dataclasses import replace
 from functools import cache
@@ -287,3 +288,13 @@ def test_a_lens_that_two_images_show_stays(monkeypatch: pytest.MonkeyPatch) -> N
     given = pair(1, distortion=-0.25, noise=0.2, count=500)
     found = aligned(given)
     assert found.distortion == unweighed(given, monkeypatch).distortion == pytest.approx(-0.25, abs=0.003)
+
+
+def test_a_guessed_focal_length_is_that_of_fisheyes_with_as_much_barrel_distortion() -> None:
+    guessed = AlignmentOptions().camera_priors([Camera(SIZE).with_focal()])
+    equidistant = -(0.8**-2.0) / 3.0  # λ where the focal length is 0.8 half diagonals
+    assert guessed.with_lens(equidistant).log_focal == pytest.approx(math.log(0.8), abs=0.1)
+    for distortion in (-0.1, 0.0, 0.2):
+        assert guessed.with_lens(distortion).log_focal == pytest.approx(math.log(1.2))
+    of_exif = AlignmentOptions().camera_priors([Camera(SIZE).with_focal(500.0, "exif")])
+    assert of_exif.with_lens(equidistant) == of_exif
