@@ -163,16 +163,8 @@ def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: Co
     )
     matrix, size = saved.plane_to_output, saved.record.output.size
     same_sizes = all(saved.images[index].size == source.camera.image_size for index, source in used.items())
-    if (
-        asked
-        or not same_sizes
-        or saved.turned
-        or not options.same_turn(saved.composite)
-        or matrix is None
-        or size is None
-    ):
-        return None
-    return SavedGrid(matrix, size, saved.output_place)
+    alike = same_sizes and not asked and not saved.turned and options.same_turn(saved.composite)
+    return SavedGrid(matrix, size, saved.output_place) if alike and matrix is not None and size is not None else None
 
 
 def _lens_of_band(
