@@ -43,22 +43,14 @@ from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.verification.verdict import RefusedError
 
+# What a camera can have done: turned, moved over a plane, or anything that joins images of a plane.
 _MODELS = ("rotation", "pose", "homography")
-"""What a camera can have done: turned, moved over a plane, or anything that joins images of a plane."""
-
-_CLEARLY = 0.5
-"""Share of the broken places up to which another layout is clearly better."""
-
-_MISFIT = 2.0
-"""Times the errors of the most probable layout that another one may have."""
-
-_SAMPLED_PAIRS = 500
-"""Pairs whose matches say how large errors are."""
-
+_CLEARLY = 0.5  # share of the broken places up to which another layout is clearly better
+_MISFIT = 2.0  # times the errors of the most probable layout that another one may have
+_SAMPLED_PAIRS = 500  # pairs whose matches say how large errors are
+# Of an image's diagonal: by how much another layout must move more than a few places of the overlaps for its seams to
+# be others.
 _MIN_SHIFT, _SHIFT_QUANTILE = 3.0 / DIAGONAL, 0.95
-"""Of an image's diagonal: by how much another layout must move more than a few places of the overlaps for its seams to
-be others."""
-
 _BY_CHANCE = Message(
     "the images are no more alike where they were put together than anywhere else; take images that overlap more",
     severity="failure",

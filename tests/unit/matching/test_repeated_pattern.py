@@ -9,6 +9,7 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import rdstitch
 from examples.worlds.correspondences import stored
@@ -16,6 +17,7 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features import Correspondences, FeatureOptions, Features, detect, match
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
+from rdstitch.matching.copies import near_copies_of
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.pair_estimator import FeatureMatching, PairEstimator
 from rdstitch.matching.repeated_pattern import _MIN_REPETITION, match_pattern, match_repeated_patterns, repetition
@@ -85,6 +87,13 @@ def _still(moved: FloatArray, image1: int = 0, image2: int = 1) -> PairRegistrat
     return PairRegistration(image1, image2, StoredMatches.of(matched), relation)
 
 
+def _numbered(points: FloatArray, lens: Camera = LENS) -> Features:
+    """Features that all look alike, and whose scales are their numbers."""
+    one, numbers = np.ones(len(points)), np.arange(float(len(points)))
+    descriptors = np.zeros((len(points), 8), np.float32)
+    return Features(points, descriptors, numbers, one, one, None, "made up", lens.image_size)
+
+
 def _failed(image1: int, image2: int) -> PairRegistration:
     pair = _still(np.zeros(10), image1, image2)
     return PairRegistration(image1, image2, pair.matches, RadialHomography.failed("no", LENS, LENS, 10))
@@ -106,11 +115,7 @@ def test_only_inliers_decide_and_no_failed_pair_is_static() -> None:
 
 def test_what_moves_by_less_than_the_threshold_is_taken_out_of_static_pairs_only() -> None:
     count = 40
-    one = np.ones(count)
-    numbers = np.arange(count, dtype=np.float64)
-    features = [
-        Features(np.zeros((count, 2)), np.zeros((count, 8), np.float32), numbers, one, one, None, "made up")
-    ] * 3
+    features = [_numbered(np.zeros((count, 2)))] * 3
     # Of the static pair, ten matches move by more than the threshold.
     moved = np.append(np.zeros(28), [2.9, 2.9, *[3.1] * 5, *[50.0] * 5])
     pairs = [_still(moved), _still(np.full(count, 30.0), 1, 2), _failed(0, 2)]
@@ -141,21 +146,6 @@ def test_motion_is_shown_by_a_connected_good_part(links: list[tuple[int, int]], 
     assert show_motion(pairs, count, THRESHOLD) is shown
 
 
-def _overlaid(static: int, image1: int = 0, image2: int = 1) -> PairRegistration:
-    """A pair that moves, with some static matches that are no inliers."""
-    pair = _still(np.append(np.full(40, 30.0), np.zeros(static)), image1, image2)
-    pair.relation.inliers[40:] = False
-    return pair
-
-
-def test_static_matches_besides_motion_are_a_background_where_several_pairs_have_them() -> None:
-    move = _still(np.full(40, 30.0))
-    assert has_static_background([_overlaid(8), _overlaid(8), move], THRESHOLD)
-    assert not has_static_background([_overlaid(7), _overlaid(7), move], THRESHOLD)
-    assert not has_static_background([_overlaid(8), move, move], THRESHOLD)
-    assert not has_static_background([_overlaid(8), _overlaid(8), *[move] * 9], THRESHOLD)
-
-
 def _with_overlay(static: int, image1: int = 0, image2: int = 1, *, seed: int = 0) -> PairRegistration:
     """A pair that moves by 30 pixels, with so many static outliers at the same places of every such pair."""
     pair = _still(np.append(np.full(40, 30.0), np.full(static, 0.2)), image1, image2)
@@ -164,9 +154,16 @@ def _with_overlay(static: int, image1: int = 0, image2: int = 1, *, seed: int = 
     return pair
 
 
+def test_static_matches_besides_motion_are_a_background_where_several_pairs_have_them() -> None:
+    move = _still(np.full(40, 30.0))
+    assert has_static_background([_with_overlay(8), _with_overlay(8), move], THRESHOLD)
+    assert not has_static_background([_with_overlay(7), _with_overlay(7), move], THRESHOLD)
+    assert not has_static_background([_with_overlay(8), move, move], THRESHOLD)
+    assert not has_static_background([_with_overlay(8), _with_overlay(8), *[move] * 9], THRESHOLD)
+
+
 def test_of_a_pair_that_moves_only_static_outliers_are_taken_out() -> None:
-    one, numbers = np.ones(48), np.arange(48.0)
-    features = [Features(np.zeros((48, 2)), np.zeros((48, 8), np.float32), numbers, one, one, None, "made up")] * 2
+    features = [_numbered(np.zeros((48, 2)))] * 2
     first, second = moving_features(FeatureStore.of(features), [_with_overlay(8)], THRESHOLD)
     assert first.scale.tolist() == list(range(40))
     assert second.scale.tolist() == list(range(8, 48))
@@ -176,9 +173,9 @@ def test_of_a_pair_that_moves_only_static_outliers_are_taken_out() -> None:
 def test_a_place_is_static_from_three_static_matches_on(pairs: int, left: int) -> None:
     """Of an image of which no pair was estimated."""
     seen = [_with_overlay(8, 0, 1 + k, seed=k) for k in range(pairs)]
-    one, points = np.ones(48), seen[0].correspondences.points1.copy()
+    points = seen[0].correspondences.points1.copy()
     points[40:] += (0.6, 0.7)  # nearer than a static match moves
-    features = [Features(points, np.zeros((48, 8), np.float32), one, one, one, None, "made up", LENS.image_size)] * 6
+    features = [_numbered(points)] * 6
     assert len(moving_features(FeatureStore.of(features), seen, THRESHOLD)[5]) == left
 
 
@@ -186,11 +183,7 @@ def test_a_place_is_static_in_images_of_the_same_size_only() -> None:
     small = [_still(np.zeros(40), *images) for images in ((0, 1), (1, 2), (0, 2))]
     large, seen = Camera((4000, 3000)), _still(np.full(40, 30.0), 3, 4)
     pairs = [*small, replace(seen, relation=replace(seen.relation, camera=large, camera2=large))]
-    one, points = np.ones(40), seen.correspondences.points1
-    features = [
-        Features(points, np.zeros((40, 8), np.float32), one, one, one, None, "made up", lens.image_size)
-        for lens in (LENS, LENS, LENS, large, large)
-    ]
+    features = [_numbered(seen.correspondences.points1, lens) for lens in (LENS, LENS, LENS, large, large)]
     assert [len(left) for left in moving_features(FeatureStore.of(features), pairs, THRESHOLD)] == [0, 0, 0, 40, 40]
 
 
@@ -290,15 +283,22 @@ def test_calibrate_matches_boards_so_and_mosaics_do_not(board: Sequence) -> None
 OPTIONS = rdstitch.StitchOptions(workers=1, features=rdstitch.FeatureOptions(max_features=500))
 
 
-@pytest.mark.parametrize("place", [0, 1, 3])
-def test_a_copy_changes_nothing_and_lies_where_its_image_does(place: int) -> None:
+def _seen_in_threes() -> list[NDArray[np.uint8]]:
     lens = Camera((320, 240), distortion=-0.15, focal=300.0)
     poses = grid_poses(lens, 3, 1, overlap=0.5, yaw=0.2, seed=3)
-    taken = sequence_over(lambda size: ground(size, seed=3), lens, poses, photometry=Photometry(noise=0.01), seed=3)
-    frames = taken.frames()
-    saved_again = np.clip(frames[1].astype(int) + np.random.default_rng(0).integers(-1, 2, frames[1].shape), 0, 255)
+    return sequence_over(partial(ground, seed=3), lens, poses, photometry=Photometry(noise=0.01), seed=3).frames()
+
+
+def _saved_again(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    noisy = frame.astype(int) + np.random.default_rng(0).integers(-1, 2, frame.shape)
+    return np.clip(noisy, 0, 255).astype(frame.dtype)
+
+
+@pytest.mark.parametrize("place", [0, 1, 3])
+def test_a_copy_changes_nothing_and_lies_where_its_image_does(place: int) -> None:
+    frames = _seen_in_threes()
     with_copy = [*frames]
-    with_copy.insert(place, saved_again.astype(frames[1].dtype))
+    with_copy.insert(place, _saved_again(frames[1]))
     alone, found = (rdstitch.mosaic(images, None, OPTIONS).registration for images in (frames, with_copy))
     assert found.alignment.used.all()
     original = 2 if place <= 1 else 1
@@ -306,3 +306,25 @@ def test_a_copy_changes_nothing_and_lies_where_its_image_does(place: int) -> Non
     assert found.alignment.distortion_std == pytest.approx(alone.alignment.distortion_std, rel=0.1)
     assert abs(found.alignment.distortion - alone.alignment.distortion) < 0.3 * alone.alignment.distortion_std
     assert [message.code for message in found.alignment.messages].count("copies") == 1
+
+
+def test_a_near_copy_changes_nothing_and_lies_where_it_was_taken() -> None:
+    wide = _seen_in_threes()
+    frames = [frame[:, :316] for frame in wide]
+    images = [*frames, _saved_again(wide[1][:, 4:])]
+    alone, found = (rdstitch.mosaic(some, None, OPTIONS).registration.alignment for some in (frames, images))
+    assert (found.distortion, found.distortion_std) == (alone.distortion, alone.distortion_std)
+    np.testing.assert_allclose(found.homographies[:3], alone.homographies, atol=1e-6)
+    points = np.array([[40.0, 30.0], [160.0, 120.0], [280.0, 200.0]])
+    # Its lens has the centre 4 pixels off the middle.
+    np.testing.assert_allclose(found.transfer(1, 3, points), points - np.array([4.0, 0.0]), atol=0.6)
+
+
+def test_what_only_a_near_copy_reaches_is_no_less_joined() -> None:
+    def shifted(image1: int, image2: int, pixels: float) -> PairRegistration:
+        relation = RadialHomography(np.eye(3), CAMERA, CAMERA, np.ones(300, dtype=np.bool_))
+        return PairRegistration(image1, image2, stored(POINTS, POINTS + np.array([pixels, 0.0])), relation)
+
+    pairs = {(i, j): shifted(i, j, 3.0) for i, j in ((0, 1), (0, 2), (1, 2))}
+    assert near_copies_of(pairs) == {1: 0, 2: 0}
+    assert near_copies_of({**pairs, (1, 3): shifted(1, 3, 90.0)}) == {2: 0}
