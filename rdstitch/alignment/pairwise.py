@@ -88,13 +88,9 @@ def best_trial(links: LinkProblem, model: MotionModel) -> tuple[BundleAdjuster, 
     return replace(adjuster, min_gain=LOOSE_GAIN), start
 
 
-def fit_trial(links: LinkProblem, model: MotionModel) -> BundleAdjustmentResult:
-    """A few links on their own under one camera."""
-    adjuster, start = best_trial(links, model)
-    return adjuster.run(start)
-
-
-def fit_pairwise(problem: Problem, model: MotionModel, trial: BundleAdjustmentResult) -> BundleAdjustmentResult:
-    """All links on their own under one camera, which starts as a trial has it."""
-    adjuster, start = independent_pairs(problem, model, trial.parameters.shared)
-    return replace(adjuster, min_gain=problem.min_gain).run(start)
+def fit_pairwise(problem: Problem, model: MotionModel) -> tuple[BundleAdjustmentResult, FloatArray]:
+    """All links on their own under one camera, and the shared parameters where a few of them have put its start."""
+    adjuster, start = best_trial(problem, model)
+    shared = adjuster.run(start).parameters.shared
+    adjuster, start = independent_pairs(problem, model, shared)
+    return replace(adjuster, min_gain=problem.min_gain).run(start), shared
