@@ -63,15 +63,15 @@ class ResultEvidence:
         """Pairs of a repeated pattern, of which nobody can say by how many periods they are apart."""
         return {link.pair: link for link in self.checked if link.ambiguity.ambiguous and not link.unique}
 
-    def looks_right(self, images: Sequence[int]) -> bool:
-        """Whether what an image, or a pair, or all of them if empty, has in common with others is clearly alike."""
+    def explained_by_depth(self, images: Sequence[int]) -> bool:
+        """Whether matches of a picture disagree where an image, or a pair, or all of them if empty, look clearly alike:
+        it has depth, or something moved.
+        """
+        if not self.purpose.picture:
+            return False
         links = [link for link in self.checked if len({*images} & {*link.pair}) == len(images)]
         cells = sum(link.agreement.cells for link in links)
         return cells >= Limits.min_cells and share_alike(links) >= Limits.min_alike_fraction
-
-    def explained_by_depth(self, images: Sequence[int]) -> bool:
-        """Whether matches of a picture disagree where its images look alike: it has depth, or something moved."""
-        return self.purpose.picture and self.looks_right(images)
 
     @cached_property
     def alike_fraction(self) -> float:
