@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,16 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 import click
 
 from rdstitch.options.option import Option
-from rdstitch.options.stitch_options import StitchOptions
 from rdstitch_cli.stitching import warn_of
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.inputs.frame import Named
-    from rdstitch.inputs.frame_stream import FrameStream
     from rdstitch.pipeline.run import Run
     from rdstitch.pipeline.run_files import RunFiles
-    from rdstitch.results.pose import FollowedPoses
+    from rdstitch.results.pose import FollowedPoses, Pose
     from rdstitch.results.registration import Registration
 
 Following = Annotated[
@@ -56,6 +54,7 @@ def followed(
 ) -> Iterator[list["Named"]]:
     """Print a line for each frame as it arrives; then, inside the block, what all of them are as inputs of a recipe."""
     from rdstitch.inputs.frame_stream import open_frame_stream
+    from rdstitch.pipeline.follow import follow
     from rdstitch.system.file_access import file_state
     from rdstitch.system.outputs import Outputs
     from rdstitch.system.temporary_folder import TemporaryFolder
@@ -79,8 +78,11 @@ def followed(
             idle=idle,
             topic=run.options.topic,
         )
+        again = arrivals.comes_again
+        frames = follow(arrivals, run.options, poses, comes_again=again, preview=preview, refresh=refresh)
         try:
-            _print_poses(arrivals, run.options, poses, preview, refresh, reporter)
+            with closing(frames):
+                _print_poses(frames, reporter)
         except KeyboardInterrupt:
             reporter.note("interrupted: registering what has arrived; interrupt once more to give up")
         yield arrivals.inputs
@@ -89,29 +91,18 @@ def followed(
         preview.unlink(missing_ok=True)
 
 
-def _print_poses(
-    arrivals: "FrameStream",
-    options: StitchOptions,
-    poses: "FollowedPoses | None",
-    preview: Path | None,
-    refresh: float,
-    reporter: Reporter,
-) -> None:
+def _print_poses(frames: Iterable["Pose"], reporter: Reporter) -> None:
     """One line for each frame that arrives, until no more come."""
-    from rdstitch.pipeline.follow import follow
-
-    again, read = arrivals.comes_again, True
-    frames = follow(arrivals, options, poses, comes_again=again, preview=preview, refresh=refresh)
-    with closing(frames):
-        for frame in frames:
-            if read:
-                try:
-                    print_line(frame.as_dict())
-                except BrokenPipeError:
-                    read = False
-                    reporter.warn("nobody reads the poses any more; what arrives is registered all the same")
-            for message in frame.messages:
-                reporter.tell(message)
+    read = True
+    for frame in frames:
+        if read:
+            try:
+                print_line(frame.as_dict())
+            except BrokenPipeError:
+                read = False
+                reporter.warn("nobody reads the poses any more; what arrives is registered all the same")
+        for message in frame.messages:
+            reporter.tell(message)
 
 
 def print_line(record: dict[str, object]) -> None:

@@ -28,8 +28,9 @@ from rdstitch.choices import Purpose
 from rdstitch.robust.posterior import TWENTY_TO_ONE, Evidence
 
 _MIN_RATIO = 3.0
-"""Times by which the errors of one camera must exceed those of free homographies, one an image: these fit relief better
-than any camera does, by up to 2.2 times over strips of rendered relief, and their chains drift projectively."""
+"""Times by which the errors of one camera must exceed those of free homographies, one an image, where numbers are
+wanted: these fit relief better than any camera does, by up to 2.2 times over strips of rendered relief, and their
+chains drift projectively. In pictures seams say what errors matter."""
 
 _TYPICAL_TILT_SPREAD = math.radians(3.0)
 """Spread of tilts from which on a wider one costs: Occam's factor of the hierarchical prior on the tilts."""
@@ -90,6 +91,11 @@ class Posterior:
     def least_field(self) -> float:
         """Pixels: what neighbours share of the errors of links on their own, which no model undercuts by much."""
         return float(self.evidence.cost(self.link_errors).field[0])
+
+    @cached_property
+    def tolerable(self) -> float:
+        """Shared errors, pixels of a coordinate, that local alignment and seams can hide."""
+        return math.hypot(_TOLERABLE * float(self.evidence.farthest[0]), float(self.evidence.noise[0]))
 
     def scored(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
@@ -203,18 +209,19 @@ def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
     """The one with the best score; free homographies only of what one camera does not explain.
 
     Where a plane that nobody would lay out explains the images, so do free homographies: a turn whose errors seams can
-    hide is taken instead.
+    hide is taken instead; so it is of a picture where homographies are hardly more probable.
     """
     cameras = [one for one in tried if one.fit.model.one_camera] or tried
-    best, evidence = min(cameras, key=_score), posterior.evidence
-    if best.implausible:
-        tolerable = math.hypot(_TOLERABLE * float(evidence.farthest[0]), float(evidence.noise[0]))
-        kept = [one for one in tried if one.field < tolerable and not one.implausible]
-        kept = [one for one in kept if one.fit.model.on_sphere] or (kept if math.isinf(best.stretch) else [])
-        if kept:
-            return min(kept, key=_score)
+    best = min(cameras, key=_score)
     free = [one for one in tried if not one.fit.model.one_camera]
-    return min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_score)
+    chosen = min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_score)
+    hidden = [one for one in tried if one.field < posterior.tolerable and not one.implausible]
+    turns, kept = [one for one in hidden if one.fit.model.on_sphere], list[Hypothesis]()
+    if best.implausible:
+        kept = turns or (hidden if math.isinf(best.stretch) else [])
+    elif posterior.purpose.picture and not chosen.fit.model.one_camera:
+        kept = [one for one in turns if one.score < chosen.score + TWENTY_TO_ONE]
+    return min(kept, key=_score, default=chosen)
 
 
 def _score(one: Hypothesis) -> float:
@@ -223,7 +230,8 @@ def _score(one: Hypothesis) -> float:
 
 def _is_beyond_one_camera(posterior: Posterior, best: Hypothesis, free: float) -> bool:
     """Whether free homographies with such a field compete; two images need no more than one."""
-    return posterior.problem.count == 2 or best.implausible or best.field > _MIN_RATIO * free
+    largest = posterior.tolerable if posterior.purpose.picture else _MIN_RATIO * free
+    return posterior.problem.count == 2 or best.implausible or best.field > largest
 
 
 def parameter_count(problem: Problem, model: MotionModel, free_lens: BoolArray) -> int:

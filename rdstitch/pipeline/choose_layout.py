@@ -43,22 +43,14 @@ from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.verification.verdict import RefusedError
 
+# What a camera can have done: turned, moved over a plane, or anything that joins images of a plane.
 _MODELS = ("rotation", "pose", "homography")
-"""What a camera can have done: turned, moved over a plane, or anything that joins images of a plane."""
-
-_CLEARLY = 0.5
-"""Share of the broken places up to which another layout is clearly better."""
-
-_MISFIT = 2.0
-"""Times the errors of the most probable layout that another one may have."""
-
-_SAMPLED_PAIRS = 500
-"""Pairs whose matches say how large errors are."""
-
+_CLEARLY = 0.5  # share of the broken places up to which another layout is clearly better
+_MISFIT = 2.0  # times the errors of the most probable layout that another one may have
+_SAMPLED_PAIRS = 500  # pairs whose matches say how large errors are
+# Of an image's diagonal: by how much another layout must move more than a few places of the overlaps for its seams to
+# be others.
 _MIN_SHIFT, _SHIFT_QUANTILE = 3.0 / DIAGONAL, 0.95
-"""Of an image's diagonal: by how much another layout must move more than a few places of the overlaps for its seams to
-be others."""
-
 _BY_CHANCE = Message(
     "the images are no more alike where they were put together than anywhere else; take images that overlap more",
     severity="failure",
@@ -218,7 +210,7 @@ def _error(registration: Registration) -> float:
     pairs = [pair for pair in distinct_pairs if used[pair.image1] and used[pair.image2]]
     some = [pairs[k] for k in evenly_spaced(len(pairs), _SAMPLED_PAIRS).tolist()]
     errors = np.concatenate([np.zeros(0), *(pair.errors(transfer)[pair.relation.inliers] for pair in some)])
-    return float(np.median(np.nan_to_num(errors, nan=np.inf))) if len(errors) else math.inf
+    return float(np.median(errors)) if len(errors) else math.inf
 
 
 def _differs(registration: Registration, allowed: float, other: Alignment, *, stretched: bool) -> bool:
@@ -234,4 +226,4 @@ def _differs(registration: Registration, allowed: float, other: Alignment, *, st
         before, after = (one.transfer(i, j, points) for one in (alignment, other))
         inside = ((before >= 0.0) & (before < alignment.cameras[j].image_size)).all(axis=1)
         moved.append(np.linalg.norm(after - before, axis=1)[inside] / (2.0 * alignment.cameras[j].scale))
-    return not np.quantile(np.nan_to_num(np.concatenate(moved), nan=np.inf), _SHIFT_QUANTILE) <= _MIN_SHIFT
+    return not np.quantile(np.concatenate(moved), _SHIFT_QUANTILE, method="higher") <= _MIN_SHIFT

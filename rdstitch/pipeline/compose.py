@@ -29,7 +29,7 @@ from rdstitch.io.formats import check_memory, check_size
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.options.upright_options import Corners
-from rdstitch.pipeline.map_canvas import place_messages, place_on_canvas, plan_on_map
+from rdstitch.pipeline.map_canvas import place_on_canvas, plan_on_map
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages
@@ -41,6 +41,7 @@ from rdstitch.verification.output_messages import (
     differing_profile_messages,
     lost_profile_messages,
     masked_messages,
+    place_messages,
     seam_messages,
 )
 

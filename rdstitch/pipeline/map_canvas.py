@@ -9,12 +9,11 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
 from rdstitch.errors import ArgumentError
-from rdstitch.export.georeference import Georeference, check_summary, map_summary
+from rdstitch.export.georeference import Georeference
 from rdstitch.export.map_grid import MapGrid, grid_of_extent, read_grid
 from rdstitch.export.place_on_map import MIN_POSITIONS, has_place, place_on_map
 from rdstitch.geometry.crs import Crs
 from rdstitch.inputs.source import Source
-from rdstitch.results.messages import MAX_NAMED, Message
 from rdstitch.results.placed_images import PlacedImages
 
 
@@ -129,31 +128,3 @@ def place_on_canvas(place: Georeference | None, one: Canvas, other: Canvas) -> G
     if place is None or np.array_equal(one.matrix, other.matrix):  # without rounding: grids are compared
         return place
     return place.after(other.matrix @ np.linalg.inv(one.matrix))
-
-
-def place_messages(place: Georeference | None, reason: str, placed: PlacedImages) -> list[Message]:
-    """What the user should know of the place; nothing where hardly an image has a position."""
-    lost = [source for source in placed.sources if source.metadata.gps_problem]
-    messages = [
-        Message(f"{each.metadata.gps_problem}, and was not used; give --positions", (str(each.path),)) for each in lost
-    ]
-    if place is None:
-        known = reason and placed.has_place
-        return [*messages, Message(f"not georeferenced: {reason}")] if known else messages
-    messages += [Message(reason)] if reason else []
-    messages.append(Message(map_summary(place), severity="note"))
-    if place.assumption:
-        messages.append(Message(place.assumption))
-    if place.checks:
-        messages.append(Message(check_summary(place), severity="note"))
-    if place.rejected:
-        names = [name for name, _ in place.rejected]
-        more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-        off = max(away for _, away in place.rejected)
-        messages.append(
-            Message(
-                f"{place.source} that the images contradict, by up to {off:.3g} m, were not used: "
-                f"{', '.join(names[:MAX_NAMED])}{more}"
-            )
-        )
-    return messages

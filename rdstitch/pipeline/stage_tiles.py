@@ -89,7 +89,6 @@ def tiles(
     ):
         registration = _registered(listed, run, options, positions_file, outputs)
         with run.executor(len(registration.sources)) as executor:
-            _write_beside(outputs, positions_file, options, registration)
             chosen = lay_out(registration, no_local_alignment("tiles on a stage"), options.composite)
             chosen = replace(chosen, plan=replace(chosen.plan, photographs=False))
             return compose_registration(chosen, run, outputs, executor)
@@ -133,7 +132,6 @@ def place_tiles(
         Outputs(options.overwrite) as outputs,
     ):
         registration = _registered(listed, run, options, positions_file, outputs)
-        _write_beside(outputs, positions_file, options, registration)
     assert registration.tiles is not None
     return registration.tiles, registration
 
@@ -141,7 +139,7 @@ def place_tiles(
 def _registered(
     listed: FoundImages, run: Run, options: TileOptions, positions_file: str | Path | None, outputs: Outputs
 ) -> Registration:
-    """The places of all tiles, once it is clear that everything can be written."""
+    """The places of all tiles, once it is clear that everything can be written; their tables are."""
     tables = [Path(file) for file in (positions_file, options.save_flat_field) if file is not None]
     names = [frame.name for frame in listed.frames]
     RunFiles.of_images(run, listed.files, names, more_files=tables).check(outputs)
@@ -164,6 +162,7 @@ def _registered(
                 raise
             unread += damaged
     tiled = replace(tiled, z=options.z, time=options.time)
+    _write_beside(outputs, positions_file, options, sources, tiled)
     return tiles_as_registration(sources, tiled).with_messages([*unread, *listed.messages, *notes, *messages])
 
 
@@ -236,17 +235,22 @@ def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
     return agrees_with_overlaps(field, compared)
 
 
-def _write_beside(outputs: Outputs, file: str | Path | None, options: TileOptions, registration: Registration) -> None:
+def _write_beside(
+    outputs: Outputs,
+    file: str | Path | None,
+    options: TileOptions,
+    sources: Sequence[Source],
+    tiled: TileRegistration,
+) -> None:
     """The table of places, and the flat field, where they are wanted."""
-    tiled = registration.tiles
-    if options.dry_run or tiled is None:
+    if options.dry_run:
         return
     if file is not None:
-        names = [source.name for source in registration.sources]
+        names = [source.name for source in sources]
         places = tiled.adjustment.places - tiled.adjustment.places.min(axis=0)
         fiji = Path(file).suffix.lower() == ".txt"
         outputs.write(file, text_bytes(fiji_list(names, places) if fiji else places_table(names, tiled)))
-    field = registration.sources[0].flat_field
+    field = sources[0].flat_field
     if options.save_flat_field is not None and field is not None:
         with outputs.writing(options.save_flat_field) as staged:
             field.write(staged)

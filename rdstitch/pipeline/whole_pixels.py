@@ -12,16 +12,9 @@ from rdstitch.results.registration import Registration
 from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 from rdstitch.robust.posterior import Evidence
 
-_RESOLVED = 0.1
-"""Standard deviation of the shift of a pair, pixels, up to which its matches can say that it is whole."""
-
-_FREEDOM = 4
-"""Parameters of an image that whole pixels take the place of: two of the shift, turn and scale."""
-
-_UPRIGHT = 0.01
-"""Largest turn of the reference image in the output, radians, where that can be its frame."""
-
-
+_RESOLVED = 0.1  # standard deviation of the shift of a pair, pixels, up to which its matches can say that it is whole
+_FREEDOM = 4  # parameters of an image that whole pixels take the place of: two of the shift, turn and scale
+_UPRIGHT = 0.01  # largest turn of the reference image in the output, radians, where that can be its frame
 _REASON = "moved by whole pixels, as parts of one image are"
 
 

@@ -55,8 +55,8 @@ class PlacedImages:
     # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.straighten`
     orientation: FloatArray | None = None
     relief: float = 0.0  # pixels that neighbours are off together, where the ground is no plane
-    lever_std: float = 0.0  # lever_std, leverage: see Located
-    leverage: Mapping[int | str, float] = field(default_factory=dict)
+    lever_std: float = 0.0  # see Located
+    leverage: Mapping[int | str, float] = field(default_factory=dict)  # see Located
     grid: SavedGrid | None = None  # pixels that the output is made on
 
     @classmethod

@@ -12,7 +12,7 @@ from rdstitch.matching.two_view import Pair
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import NO_CACHE, Cache
 from rdstitch.verification.limits import Limits
-from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps, share_alike
+from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps
 
 
 @dataclass(frozen=True)
@@ -64,14 +64,14 @@ class ResultEvidence:
         return {link.pair: link for link in self.checked if link.ambiguity.ambiguous and not link.unique}
 
     def explained_by_depth(self, images: Sequence[int]) -> bool:
-        """Whether matches of a picture disagree where an image, or a pair, or all of them if empty, look clearly alike:
-        it has depth, or something moved.
+        """Whether matches of an image, of a pair, or of all if empty, disagree where a picture is more alike than by
+        chance: it has depth, or something moved.
         """
         if not self.purpose.picture:
             return False
-        links = [link for link in self.checked if len({*images} & {*link.pair}) == len(images)]
-        cells = sum(link.agreement.cells for link in links)
-        return cells >= Limits.min_cells and share_alike(links) >= Limits.min_alike_fraction
+        overlaps = [link.agreement for link in self.checked if len({*images} & {*link.pair}) == len(images)]
+        cells, confirming = sum(each.cells for each in overlaps), sum(each.confirming for each in overlaps)
+        return cells >= Limits.min_cells and confirming >= Limits.max_unlike_fraction * cells
 
     @cached_property
     def alike_fraction(self) -> float:

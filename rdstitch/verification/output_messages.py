@@ -1,10 +1,11 @@
-"""What the user should know of an output: what is cut away, broken seams, colour profiles."""
+"""What the user should know of an output: its place, what is cut away, broken seams, colour profiles."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from rdstitch.compositing import Canvas, CompositeOptions, SeamQuality
 from rdstitch.compositing.projection import PLANE
+from rdstitch.export.georeference import Georeference, check_summary, map_summary
 from rdstitch.inputs.source import Source
 from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
@@ -31,6 +32,30 @@ def cut_away_messages(placed: PlacedImages, canvas: Canvas, options: CompositeOp
     if placed.turned and canvas.projection == PLANE:
         text += "; --projection cylinder or sphere shows more"
     return [Message(text, severity="note")] if share > Limits.visible_cut else []
+
+
+def place_messages(place: Georeference | None, reason: str, placed: PlacedImages) -> list[Message]:
+    """What the user should know of the place; nothing where hardly an image has a position."""
+    lost = [source for source in placed.sources if source.metadata.gps_problem]
+    messages = [
+        Message(f"{each.metadata.gps_problem}, and was not used; give --positions", (str(each.path),)) for each in lost
+    ]
+    if place is None:
+        known = reason and placed.has_place
+        return [*messages, Message(f"not georeferenced: {reason}")] if known else messages
+    messages += [Message(reason)] if reason else []
+    messages.append(Message(map_summary(place), severity="note"))
+    if place.assumption:
+        messages.append(Message(place.assumption))
+    if place.checks:
+        messages.append(Message(check_summary(place), severity="note"))
+    if place.rejected:
+        names = [name for name, _ in place.rejected]
+        more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
+        off = max(away for _, away in place.rejected)
+        text = f"{place.source} that the images contradict, by up to {off:.3g} m, were not used: "
+        messages.append(Message(f"{text}{', '.join(names[:MAX_NAMED])}{more}"))
+    return messages
 
 
 def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:

@@ -113,12 +113,6 @@ def check_overlaps(registration: Registration, images: ComparedImages, cache: Ca
     return cache.recall("overlaps", inputs, compute)
 
 
-def share_alike(checked: Sequence[CheckedLink]) -> float:
-    """Share of all overlaps together that looks alike, in [0, 1]; NaN where nothing was compared."""
-    cells = sum(link.agreement.cells for link in checked)
-    return sum(link.agreement.confirming for link in checked) / cells if cells else float("nan")
-
-
 def wrong_at_most(checked: Sequence[CheckedLink]) -> float:
     """Share of all links that may look unlike, by those taken at random (Wilson's upper bound, 95 %); 1 without any."""
     cells, unlike = Limits.min_cells, Limits.max_unlike_fraction

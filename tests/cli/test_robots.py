@@ -3,6 +3,7 @@
 import json
 import re
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -92,17 +93,8 @@ def _write_bag(
     typesys = pytest.importorskip("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if version == 1 else typesys.Stores.LATEST)
     time_type, header_type = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
-    writer: Any
-    if version == 1:
-        from rosbags.rosbag1 import Writer as Writer1
-
-        path = folder / "drive.bag"
-        writer = Writer1(path)
-    else:
-        from rosbags.rosbag2 import Writer as Writer2
-
-        path = folder / "drive"
-        writer = Writer2(path, version=9)
+    path = folder / ("drive.bag" if version == 1 else "drive")
+    writer: Any = import_module(f"rosbags.rosbag{version}").Writer(path, **({"version": 9} if version == 2 else {}))
     name = "sensor_msgs/msg/CompressedImage" if kind == "compressed" else "sensor_msgs/msg/Image"
     with writer:
         connection = writer.add_connection("/camera", name, typestore=store)

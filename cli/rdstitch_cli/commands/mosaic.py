@@ -1,15 +1,14 @@
 """``rdstitch mosaic``: a folder of frames becomes one rectified image."""
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Annotated, Any
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
 from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.option import Option
 from rdstitch.options.shared_options import Every
-from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import shortened
 from rdstitch_cli.flags import ImageFile, Inputs, PrintSidecar, command, flags_of
 from rdstitch_cli.following import Following, Idle, followed, print_result
@@ -23,6 +22,9 @@ from rdstitch_cli.stitching import (
     stitch_options,
 )
 from rdstitch_cli.terminal import Reporter
+
+if TYPE_CHECKING:
+    from rdstitch.inputs.frame import Named
 
 
 @command(
@@ -85,9 +87,7 @@ def mosaic(
     beside = files_beside(given)
     options = stitch_options(given, preview=preview, pose_covariance=beside.poses is not None)
     how: dict[str, Any] = {"every": every, "progress": reporter, "beside": beside}
-    if following:
-        _follow(inputs, output, options, reporter, idle=idle, refresh=refresh, as_json=as_json, **how)
-    elif bands is not None:
+    if bands is not None:
         from rdstitch.pipeline.bands import mosaic_bands, parse_bands  # with all that reads an earlier result
 
         first, others = mosaic_bands(resolve(inputs), output, parse_bands(bands), options, **how)
@@ -102,35 +102,23 @@ def mosaic(
             report_result(block, reporter, as_json=as_json, more=f" ({names})")
     else:
         from rdstitch.pipeline.recipes import mosaic as recipe
+        from rdstitch.pipeline.run import Run
+        from rdstitch.pipeline.run_files import RunFiles
 
-        report_result(recipe(resolve(inputs), output, options, **how), reporter, as_json=as_json)
-
-
-def _follow(
-    inputs: Sequence[Path],
-    output: Path,
-    options: StitchOptions,
-    reporter: Reporter,
-    *,
-    every: int | None,
-    idle: float | None,
-    refresh: float,
-    as_json: bool,
-    beside: FilesBeside,
-    progress: Reporter,
-) -> None:
-    """Print a line for each frame as it arrives, then stitch all, and print what came of it."""
-    from rdstitch.pipeline.recipes import mosaic as recipe
-    from rdstitch.pipeline.run import Run
-    from rdstitch.pipeline.run_files import RunFiles
-
-    preview = output.with_suffix(".preview.jpg") if refresh else None
-    run = Run.of(inputs, options, output, beside)
-    files = RunFiles.of_images(run, inputs, more_files=[] if preview is None else [preview])
-    with followed(inputs, run, files, reporter, every=every, idle=idle, preview=preview, refresh=refresh) as paths:
-        result = recipe(paths, output, run.options, every=every, progress=progress, beside=beside)
-        if as_json:
-            report_result(result, reporter, as_json=True)
-        else:
-            print_result(result.registration, reporter, output)
-            reporter.made(result.summary)
+        with ExitStack() as stack:
+            paths: Sequence[Named]
+            live: dict[str, Any]
+            if following:
+                file = output.with_suffix(".preview.jpg") if refresh else None
+                run = Run.of(inputs, options, output, beside)
+                files = RunFiles.of_images(run, inputs, more_files=[] if file is None else [file])
+                options, live = run.options, {"every": every, "idle": idle, "preview": file, "refresh": refresh}
+                paths = stack.enter_context(followed(inputs, run, files, reporter, **live))
+            else:
+                paths = resolve(inputs)
+            result = recipe(paths, output, options, **how)
+            if following and not as_json:
+                print_result(result.registration, reporter, output)
+                reporter.made(result.summary)
+            else:
+                report_result(result, reporter, as_json=as_json)

@@ -10,7 +10,7 @@ import pytest
 from examples.worlds.alignment_scenes import aligned, fitted, grid, grid_scene, scene
 from examples.worlds.turns import camera_rotations
 from rdstitch.alignment import Alignment, AlignmentOptions, align
-from rdstitch.alignment.adjustment_problem import Problem
+from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.motion_models import HOMOGRAPHY, PSI, RIGID, ROTATION, MotionModel
 from rdstitch.alignment.select import Hypothesis, ModelChoice, Posterior, _best, select_model
 from rdstitch.arrays import FloatArray
@@ -121,26 +121,46 @@ def test_depth_in_two_images_is_not_taken_for_a_lens() -> None:
     assert [message.severity for message in lens.messages if "depth" in message.text] == ["failure"]
 
 
+def _posterior(count: int) -> tuple[Posterior, Fit]:
+    """Of images over a plane; seams hide a quarter of 4 pixels, and the noise: 1.17 pixels."""
+    rng = np.random.default_rng(0)
+    problem, fit = fitted(scene(grid(count, 1, (0.4, 0.3), 0.2, rng), rng=rng))
+    posterior = Posterior(problem)
+    vars(posterior)["evidence"] = replace(posterior.evidence, farthest=np.array([4.0]), noise=np.array([0.6]))
+    return posterior, fit
+
+
 @pytest.mark.parametrize(
-    ("stretch", "turn", "chosen"),
+    ("stretch", "plane", "turn", "chosen"),
     [
-        (20.0, 1.1, "rotation"),  # what seams hide
-        (20.0, 1.5, "homography"),
-        (math.inf, 1.5, "homography"),
-        (7.0, 1.1, "homography"),
+        (20.0, 0.9, 1.1, "rotation"),  # what seams hide
+        (20.0, 0.9, 1.5, "homography"),
+        (math.inf, 0.9, 1.5, "homography"),
+        (7.0, 0.9, 1.1, "rigid"),  # homographies add up their errors, and show no more of the scene
+        (7.0, 1.2, 1.1, "homography"),
     ],
 )
-def test_a_turn_may_leave_what_seams_hide(stretch: float, turn: float, chosen: str) -> None:
-    problem, fit = fitted(scene(grid(3, 1, (0.4, 0.3), 0.2, np.random.default_rng(0)), rng=np.random.default_rng(0)))
-    posterior = Posterior(problem)
-    # A quarter of 4 px, and the noise: 1.17 px.
-    known = replace(posterior.evidence, farthest=np.array([4.0]), noise=np.array([0.6]))
-    vars(posterior)["evidence"] = known
+def test_one_camera_may_leave_what_seams_hide(stretch: float, plane: float, turn: float, chosen: str) -> None:
+    posterior, fit = _posterior(3)
 
     def hypothesis(model: MotionModel, score: float, field: float) -> Hypothesis:
         return Hypothesis(replace(fit, model=model), score, field, stretch if model is RIGID else 1.0)
 
-    tried = [hypothesis(ROTATION, 60.0, turn), hypothesis(RIGID, 0.0, 0.9), hypothesis(HOMOGRAPHY, -30.0, 0.2)]
+    tried = [hypothesis(ROTATION, 60.0, turn), hypothesis(RIGID, 0.0, plane), hypothesis(HOMOGRAPHY, -30.0, 0.2)]
+    assert _best(posterior, tried).fit.model.name == chosen
+
+
+@pytest.mark.parametrize(
+    ("turn", "field", "chosen"), [(3.0, 1.1, "rotation"), (3.0, 1.5, "homography"), (9.0, 1.1, "homography")]
+)
+def test_of_two_images_a_turn_is_taken_where_a_homography_is_hardly_more_probable(
+    turn: float, field: float, chosen: str
+) -> None:
+    posterior, fit = _posterior(2)
+    tried = [
+        Hypothesis(replace(fit, model=model), score, errors, 1.0)
+        for model, score, errors in ((ROTATION, turn, field), (RIGID, 80.0, 4.0), (HOMOGRAPHY, 0.0, 0.2))
+    ]
     assert _best(posterior, tried).fit.model.name == chosen
 
 

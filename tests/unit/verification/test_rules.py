@@ -139,6 +139,20 @@ def test_poses_by_what_fills_less_than_half_of_the_images_are_none(
     assert [finding.severity for finding in found if finding.kind is Kind.RIVAL_MOTION] == severity
 
 
+@pytest.mark.parametrize(
+    ("purpose", "share", "placed"),
+    [(Purpose.MOSAIC, 0.15, True), (Purpose.MOSAIC, 0.05, False), (Purpose.TRAJECTORY, 0.15, False)],
+)
+def test_matches_of_a_picture_may_disagree_where_it_is_more_alike_than_by_chance(
+    purpose: Purpose, share: float, placed: bool
+) -> None:
+    """Depth, or what moved: seams go round it, or are told of; poses have nothing but their matches."""
+    given = registration(2, links=(LinkFit(0, 1, 100, 40, 0.5, True),), keypoints=(900, 900))
+    link = replace(_checked(share, (0, 1), unique=False), agreement=Agreement(100, round(100 * share), 100, 0.6))
+    found = evidence(given, purpose, checked=[link])
+    assert bool(failures_of_matches(found)) is not placed
+
+
 def _misfits(count: int, *, agree: float = 0.2, keypoints: tuple[int, ...] = (900, 900, 900)) -> list[Message]:
     """What is said of two images with so many matches, of which a share agrees with the alignment."""
     fit = LinkFit(0, 1, count, int(agree * count), 0.5, True)
