@@ -161,7 +161,7 @@ class CameraKnowledge:
 
     def covariance(self, placed: TrackedFrame, pose: CameraPose) -> FloatArray | None:
         """Of a frame's pose, with what all frames have in common but for the unit of lengths."""
-        covariance, (relative, yaw_std) = placed.place.covariance, self.shape_std
+        covariance, (relative, yaw_std) = placed.covariance, self.shape_std
         if covariance is None:
             if not relative:
                 return None

@@ -82,7 +82,7 @@ def _registered(frame: Frame, matched: Sequence[Matched], knowledge: CameraKnowl
         ]
     links = []  # where the lens is known, a homography of undistorted points
     for other, points1, points2, _ in matched:
-        camera, camera2 = (knowledge.camera_with_lens_of(other.place.placement, one) for one in (other.frame, frame))
+        camera, camera2 = (knowledge.camera_with_lens_of(other.placement, one) for one in (other.frame, frame))
         homography, inliers = fitted_homography(camera2, camera, points2, points1, MATCH_ERROR)
         # A few wrong matches do not make a link: a homography takes four of any.
         if homography is None or inliers.sum() < MIN_INLIERS + _WRONG * len(points1):

@@ -1,7 +1,7 @@
 """The map: the last keyframes, which are aligned together, older ones, and the frames placed by them."""
 
 from collections import deque
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.frame_links import MATCH_ERROR, fitted_homography, links_by_corners, links_by_features
 from rdstitch.tracking.metric_plane import chained
 from rdstitch.tracking.placement import Placement, PlaneSimilarity
-from rdstitch.tracking.tracked_frame import Frame, FramePlace, TrackedFrame
+from rdstitch.tracking.tracked_frame import Frame, TrackedFrame
 
 _WINDOW = 48  # last keyframes, that are aligned together
 _KEPT = 200  # older keyframes at the most, among which a lost frame looks for its place
@@ -63,11 +63,6 @@ class KeyframeMap:
         self.between.append((frame, self.keyframes[-1], before, now))
 
     @property
-    def whole(self) -> bool:
-        """Whether the last keyframes are all of them."""
-        return not self.older
-
-    @property
     def by_number(self) -> dict[int, TrackedFrame]:
         """All keyframes."""
         return {keyframe.number: keyframe for keyframe in (*self.older, *self.keyframes)}
@@ -80,7 +75,7 @@ class KeyframeMap:
     @property
     def keeps_focal(self) -> bool:
         """Whether alignments keep the focal length: that of one map must not depend on the window."""
-        return self.knowledge.focal is not None and (self.knowledge.stated_std > 0.0 or not self.whole)
+        return self.knowledge.focal is not None and (self.knowledge.stated_std > 0.0 or bool(self.older))
 
     def links_with(self, frame: Frame, placed: TrackedFrame | None, match: Matcher) -> list[Link]:
         """Links of a frame with the last keyframes, as far as they can be registered; of a lost one, with more."""
@@ -96,7 +91,7 @@ class KeyframeMap:
                 # What a frame shows again is among the last keyframes again.
                 self.keyframes = [k for k in self.keyframes if k not in shown] + shown[::-1]
                 self.older = [k for k in self.older if k not in shown]
-                return links_by_corners(TrackedFrame(frame, about), shown, self.knowledge) or links
+                return links_by_corners(about, shown, self.knowledge) or links
         return []
 
     def _to_search(self) -> list[TrackedFrame]:
@@ -120,45 +115,44 @@ class KeyframeMap:
 
     def place(
         self, frame: Frame, other: TrackedFrame, before: FloatArray, now: FloatArray, *, rough: bool = False
-    ) -> FramePlace | None:
-        """Where a frame lies by points (N, 2) of a keyframe that it shows too; None where no homography fits them."""
-        start, knowledge = other.place, self.knowledge
-        camera = knowledge.camera_with_lens_of(start.placement, frame)
+    ) -> TrackedFrame | None:
+        """A frame where it lies by points (N, 2) of a keyframe that it shows too; None where no homography fits."""
+        start, knowledge = other.placement, self.knowledge
+        camera = knowledge.camera_with_lens_of(start, frame)
         rough |= not (self.has_plane or knowledge.distortion_known)
         error = _ROUGH * max(frame.camera.image_size) if rough else MATCH_ERROR
-        homography, inliers = fitted_homography(start.placement.camera, camera, before, now, error)
+        homography, inliers = fitted_homography(start.camera, camera, before, now, error)
         if homography is None:
             return None
-        if knowledge.plane is None or start.covariance is None:
-            placement = replace(start.placement, camera=camera, homography=start.placement.homography @ homography)
-            return FramePlace(placement, start.aligned, None, inliers)
+        if knowledge.plane is None or other.covariance is None:
+            placement = replace(start, camera=camera, homography=start.homography @ homography)
+            return TrackedFrame(frame, placement, other.aligned, None, inliers)
         below = knowledge.plane.below(camera, knowledge.attitude(frame))
         tilt_std = 0.0 if frame.attitude is None else knowledge.attitude_std(frame)
-        places = start.placement.to_plane(before[inliers])
+        places = start.to_plane(before[inliers])
         placement, step = knowledge.plane.placed(below, now[inliers], places, tilt_std=tilt_std)
-        at, was, covariance = placement.pose, start.placement.pose, None
+        at, was, covariance = placement.pose, start.pose, None
         if at is not None and was is not None:
-            covariance = chained(start.covariance, step, (at.x - was.x, at.y - was.y), was.height)
-        return FramePlace(placement, start.aligned, covariance, inliers)
+            covariance = chained(other.covariance, step, (at.x - was.x, at.y - was.y), was.height)
+        return TrackedFrame(frame, placement, other.aligned, covariance, inliers)
 
-    def place_by_links(self, frame: Frame, links: Sequence[Link]) -> FramePlace | None:
-        """Where a frame lies by the largest of its links with keyframes; None where there is none, or it cannot be."""
+    def place_by_links(self, frame: Frame, links: Sequence[Link]) -> TrackedFrame | None:
+        """A frame where it lies by the largest of its links with keyframes; None where there is none that fits."""
         by_number = self.by_number
         usable = [link for link in links if link.image2 == frame.number and link.image1 in by_number]
         if not usable:
             return None
-        best = max(usable, key=lambda link: (by_number[link.image1].place.aligned, len(link)))
+        best = max(usable, key=lambda link: (by_number[link.image1].aligned, len(link)))
         return self.place(frame, by_number[best.image1], best.points1, best.points2)
 
     def confirm_first(self, second: TrackedFrame) -> TrackedFrame | None:
         """The first keyframe, if it lies below a given camera, and a second frame is the first to show that."""
         first = self.keyframes[0]
-        unconfirmed = len(self.keyframes) == 1 and not first.place.aligned and self.knowledge.plane is not None
-        if not unconfirmed or second.place.covariance is None:
+        unconfirmed = len(self.keyframes) == 1 and not first.aligned and self.knowledge.plane is not None
+        if not unconfirmed or second.covariance is None:
             return None
         self.has_plane = True
-        for frame in (first, second):
-            frame.place = replace(frame.place, aligned=True)
+        first.aligned = second.aligned = True
         return first
 
     def align(self, placements: Mapping[int, Placement]) -> None:
@@ -166,42 +160,47 @@ class KeyframeMap:
         self.has_plane = True
         for number, keyframe in self.by_number.items():
             if number in placements:
-                keyframe.place = replace(keyframe.place, placement=placements[number], aligned=True, predicted=False)
+                keyframe.placement, keyframe.aligned, keyframe.predicted = placements[number], True, False
 
     def follow_aligned(self, aligned: Container[int]) -> None:
         """Move the last keyframes that an alignment left out to where their links with the others have them."""
         covariance = np.zeros((4, 4))
         for keyframe in self.keyframes if self.knowledge.plane is not None else []:
-            if keyframe.place.aligned:  # without a covariance, errors grow again from that of the keyframe before
-                covariance = covariance if keyframe.place.covariance is None else keyframe.place.covariance
-                keyframe.place = replace(keyframe.place, covariance=covariance)
-        for keyframe in self.keyframes:
-            if keyframe.number not in aligned:
-                keyframe.place = self.place_by_links(keyframe.frame, self.links) or keyframe.place
+            if keyframe.aligned:  # without a covariance, errors grow again from that of the keyframe before
+                covariance = covariance if keyframe.covariance is None else keyframe.covariance
+                keyframe.covariance = covariance
+        self._place_again(keyframe for keyframe in self.keyframes if keyframe.number not in aligned)
+
+    def _place_again(self, keyframes: Iterable[TrackedFrame]) -> None:
+        """Move keyframes, one after the other, to where their links with others have them."""
+        for keyframe in keyframes:
+            if (placed := self.place_by_links(keyframe.frame, self.links)) is not None:
+                keyframe.move_to(placed)
 
     def rescale(self, length_factor: float) -> None:
         """Place all keyframes again by the camera as it is known now, which changes all lengths by a factor."""
         assert self.knowledge.plane is not None
         first, *others = self.keyframes
-        was, move = first.place.pose, PlaneSimilarity(1.0, 0.0)
+        was, move = first.pose, PlaneSimilarity(1.0, 0.0)
         if was is not None:
             move = PlaneSimilarity(np.exp(-1j * was.yaw).item(), length_factor * complex(was.x, was.y))
         below = move.applied(self.knowledge.plane.below(first.frame.camera, self.knowledge.attitude(first.frame)))
-        covariance = np.zeros((4, 4)) if first.place.covariance is None else first.place.covariance
-        first.place = replace(first.place, placement=below, aligned=True, covariance=covariance)
+        first.placement, first.aligned = below, True
+        first.covariance = np.zeros((4, 4)) if first.covariance is None else first.covariance
         self.has_plane, enlarge = True, PlaneSimilarity(length_factor, 0.0)
         for keyframe in (*self.older, *others):
-            keyframe.place = replace(keyframe.place, placement=enlarge.applied(keyframe.place.placement))
-        for keyframe in others:
-            keyframe.place = self.place_by_links(keyframe.frame, self.links) or keyframe.place
+            keyframe.placement = enlarge.applied(keyframe.placement)
+        self._place_again(others)
 
     def revise(self, waiting: set[int] | None = None) -> list[TrackedFrame]:
         """Place the frames between keyframes anew; of all that have a place those that were waiting, None: all."""
         revised = self.by_number
         for placed, keyframe, before, now in self.between:
-            if keyframe.place.aligned and (waiting is None or placed.number in waiting):
-                place = self.place(placed.frame, keyframe, before, now)
-                placed.place = place or replace(placed.place, aligned=False)
+            if keyframe.aligned and (waiting is None or placed.number in waiting):
+                again = self.place(placed.frame, keyframe, before, now)
+                placed.aligned = again is not None
+                if again is not None:
+                    placed.move_to(again)
                 revised.setdefault(placed.number, placed)
         found = sorted(revised.items())
-        return [one for number, one in found if one.place.aligned and (waiting is None or number in waiting)]
+        return [one for number, one in found if one.aligned and (waiting is None or number in waiting)]

@@ -92,7 +92,7 @@ class MapRefinement:
         window = self._window
         if window is None or (alignment := self._finished(window, patience)) is None:
             return []
-        waiting = {number for number, frame in keyframe_map.frames.items() if not frame.place.aligned}
+        waiting = {number for number, frame in keyframe_map.frames.items() if not frame.aligned}
         placements, length_factor = _on_map(keyframe_map, window, alignment)
         keyframe_map.align(placements)
         knowledge, frames = keyframe_map.knowledge, [keyframe.frame for keyframe in window.keyframes]
@@ -132,7 +132,8 @@ def _on_map(keyframe_map: KeyframeMap, window: _Window, alignment: Alignment) ->
     placed = [(keyframe, Placement(camera, h, alignment.focal)) for keyframe, camera, h, used in aligned if used]
     move, length_factor = _to_map(placed)
     first, placement = placed[0]
-    if keyframe_map.whole and first.number == keyframe_map.keyframes[0].number and (pose := placement.pose) is not None:
+    is_first = not keyframe_map.older and first.number == keyframe_map.keyframes[0].number
+    if is_first and (pose := placement.pose) is not None:
         move = PlaneSimilarity.to_origin(pose)  # the others are relative to it
     return {keyframe.number: move.applied(placement) for keyframe, placement in placed}, length_factor
 
@@ -143,7 +144,7 @@ def _to_map(placed: Sequence[tuple[TrackedFrame, Placement]]) -> tuple[PlaneSimi
     The unit of lengths is the height of the first keyframe: heights stay as they are, whatever focal length they are
     computed by.
     """
-    shared = [(new, keyframe.place.placement) for keyframe, new in placed if keyframe.place.aligned]
+    shared = [(new, keyframe.placement) for keyframe, new in placed if keyframe.aligned]
     if not shared:
         pose = placed[0][1].pose
         return PlaneSimilarity(1.0, 0.0) if pose is None else PlaneSimilarity.to_origin(pose), 1.0

@@ -12,7 +12,7 @@ from rdstitch.inputs.odometry import motion_between
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.metric_plane import chained
 from rdstitch.tracking.placement import PlaneSimilarity
-from rdstitch.tracking.tracked_frame import Frame, FramePlace, TrackedFrame
+from rdstitch.tracking.tracked_frame import Frame, TrackedFrame
 
 _KEYFRAMES = 60  # the last ones, by which it is found how the camera is mounted on the body
 
@@ -34,28 +34,29 @@ class OdometryPrediction:
         last = sorted(keyframes, key=lambda keyframe: keyframe.number)[-_KEYFRAMES:]
         # x to the right and y to the top; without a body there is no motion to or from a frame.
         poses = [
-            (complex(pose.x, -pose.y), pose.yaw, None if keyframe.place.predicted else keyframe.frame.body)
+            (complex(pose.x, -pose.y), pose.yaw, None if keyframe.predicted else keyframe.frame.body)
             for keyframe in last
-            if (pose := keyframe.place.pose) is not None
+            if (pose := keyframe.pose) is not None
         ]
         self.mounted = OdometryFit.of(motions_of(poses)) or self.mounted
 
-    def place(self, frame: Frame, knowledge: CameraKnowledge) -> FramePlace | None:
-        """Where a frame lies by its way from the latest one; None where that cannot be said."""
+    def place(self, frame: Frame, knowledge: CameraKnowledge) -> TrackedFrame | None:
+        """A frame where it lies by its way from the latest one; None where that is not known."""
         last, fit = self.latest, self.mounted
         if last is None or fit is None or frame.body is None or last.frame.body is None or knowledge.plane is None:
             return None
-        was = last.place.pose
-        if was is None or last.place.covariance is None:
+        was = last.pose
+        if was is None or last.covariance is None:
             return None
         step = motion_between(last.frame.body, frame.body)
         moved = cmath.exp(1j * was.yaw) * fit.camera_motion(step.moved, step.turn)
         place, yaw = complex(was.x, was.y) + moved.conjugate(), was.yaw + step.turn
-        below = knowledge.plane.below(last.place.placement.camera, knowledge.attitude(frame))
+        below = knowledge.plane.below(last.placement.camera, knowledge.attitude(frame))
         spread = fit.noise**2 * np.array([step.variance / abs(fit.scale) ** 2] * 2 + [0.0, step.turn_variance])
-        return FramePlace(
+        return TrackedFrame(
+            frame,
             PlaneSimilarity(was.height * cmath.exp(-1j * yaw), place).applied(below),
             True,
-            chained(last.place.covariance, np.diag(spread), (moved.real, -moved.imag), was.height),
+            chained(last.covariance, np.diag(spread), (moved.real, -moved.imag), was.height),
             predicted=True,
         )

@@ -80,15 +80,17 @@ class Frame:
         return len(self.corners) >= MIN_INLIERS or len(self.features) >= MIN_INLIERS
 
 
-@dataclass(frozen=True, eq=False)
-class FramePlace:
-    """Where a frame lies relative to the keyframes."""
+@dataclass(eq=False)
+class TrackedFrame:
+    """A frame with its place relative to the keyframes, which its map may revise."""
 
+    frame: Frame
     placement: Placement
     aligned: bool = False  # whether that is on the plane of the map
     covariance: FloatArray | None = None  # (4, 4): of x, y, height and yaw; None: not known
     inliers: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))  # of the matches that it is by
     predicted: bool = False  # by odometry: images have not measured it
+    keyframe: bool = False
 
     @property
     def quality(self) -> float:
@@ -100,14 +102,10 @@ class FramePlace:
         """Pose of the camera on the map."""
         return self.placement.pose if self.aligned else None
 
-
-@dataclass(eq=False)
-class TrackedFrame:
-    """A frame with its place, which its map may revise."""
-
-    frame: Frame
-    place: FramePlace
-    keyframe: bool = False
+    def move_to(self, other: "TrackedFrame") -> None:
+        """Take the place of the same frame where it was placed again."""
+        self.placement, self.aligned, self.covariance = other.placement, other.aligned, other.covariance
+        self.inliers, self.predicted = other.inliers, other.predicted
 
     @property
     def number(self) -> int:
@@ -116,8 +114,8 @@ class TrackedFrame:
 
     def points_in(self, other: "TrackedFrame", points: FloatArray) -> FloatArray:
         """Where another frame shows points (N, 2) of this one, by the places of both."""
-        there = other.place.placement
-        return from_plane(there.camera, there.homography, self.place.placement.to_plane(points))
+        there = other.placement
+        return from_plane(there.camera, there.homography, self.placement.to_plane(points))
 
     def share_shown_by(self, other: "TrackedFrame") -> float:
         """Share of the frame that another one shows."""

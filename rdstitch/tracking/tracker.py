@@ -24,7 +24,7 @@ from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.map_refinement import MapRefinement
 from rdstitch.tracking.odometry_prediction import OdometryPrediction
 from rdstitch.tracking.placement import Placement
-from rdstitch.tracking.tracked_frame import NO_IMAGE, Frame, FramePlace, TrackedFrame, TrackingResult
+from rdstitch.tracking.tracked_frame import NO_IMAGE, Frame, TrackedFrame, TrackingResult
 
 _PATIENCE = 0.015  # seconds a frame that are waited for the first alignment
 _KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below which it becomes a keyframe
@@ -91,16 +91,14 @@ class FrameTracker:
         placed, links = self._follow(frame), list[Link]()
         if placed is None or self._is_new(placed):
             links = self._map.links_with(frame, placed, self._match)
-            if (place := self._map.place_by_links(frame, links)) is not None:
-                placed = TrackedFrame(frame, place)
+            placed = self._map.place_by_links(frame, links) or placed
         if placed is not None:
             results = self._placed(placed, links)
-        elif (place := self._odometry.place(frame, self._knowledge)) is not None:
-            placed = TrackedFrame(frame, place)
+        elif (placed := self._odometry.place(frame, self._knowledge)) is not None:
             results = self._predicted(placed)
         else:
             return [self._without_place(frame)]
-        if placed.place.pose is not None and frame.body is not None:
+        if placed.pose is not None and frame.body is not None:
             self._odometry.latest = placed
         if not placed.keyframe:
             placed.frame = replace(frame, image=NO_IMAGE)
@@ -110,12 +108,12 @@ class FrameTracker:
         """The first keyframe of a map."""
         knowledge, self._odometry.latest = self._knowledge, None
         camera = knowledge.camera_of(frame)
-        place = FramePlace(Placement(camera, np.eye(3), None))
+        first = TrackedFrame(frame, Placement(camera, np.eye(3), None), keyframe=True)
         if knowledge.plane is None:
             knowledge.adopt_given(frame.camera)
         if knowledge.plane is not None:
-            place = FramePlace(knowledge.plane.below(camera, knowledge.attitude(frame)), covariance=np.zeros((4, 4)))
-        first = TrackedFrame(frame, place, keyframe=True)
+            first.placement = knowledge.plane.below(camera, knowledge.attitude(frame))
+            first.covariance = np.zeros((4, 4))
         self._map = KeyframeMap(knowledge, [first], map_number)
         self._refinement.start_map()
         self._flow.begin(frame.image, frame.corners)
@@ -125,7 +123,7 @@ class FrameTracker:
     def _placed(self, placed: TrackedFrame, links: list[Link]) -> list[TrackingResult]:
         """A frame that keyframes show; where it has links and shows anything new, it is the next keyframe."""
         self._map.lost_frames = 0
-        inliers, last = int(placed.place.inliers.sum()), self._map.keyframes[-1].number
+        inliers, last = int(placed.inliers.sum()), self._map.keyframes[-1].number
         shown = next((link for link in links if link.image1 == last), None)
         between = shown is not None and not self._is_new(placed)
         if shown is not None and between:
@@ -141,18 +139,17 @@ class FrameTracker:
     def _follow(self, frame: Frame) -> TrackedFrame | None:
         """The frame at its place by the corners of the last keyframe; None where too few of them agree on one."""
         matched, last = self._flow.follow(frame.image), self._map.keyframes[-1]
-        place = None if matched is None else self._map.place(frame, last, *matched, rough=True)
-        if place is None or not agree(place.inliers):
+        placed = None if matched is None else self._map.place(frame, last, *matched, rough=True)
+        if placed is None or not agree(placed.inliers):
             return None
         # Where the view turns, what is followed from frame to frame drifts.
-        to_frame = partial(last.points_in, TrackedFrame(frame, place))
+        to_frame = partial(last.points_in, placed)
         now, before = matched_corners(frame.image, last.frame.image, last.frame.corners, to_frame)
-        place = self._map.place(frame, last, before, now)
-        if place is None or not agree(place.inliers):
+        placed = self._map.place(frame, last, before, now)
+        if placed is None or not agree(placed.inliers):
             return None
-        placed = TrackedFrame(frame, place)
         self._flow.begin(frame.image, before, now)
-        self._map.keep_between(placed, before[place.inliers], now[place.inliers])
+        self._map.keep_between(placed, before[placed.inliers], now[placed.inliers])
         return placed
 
     def _predicted(self, placed: TrackedFrame) -> list[TrackingResult]:
@@ -218,21 +215,21 @@ class FrameTracker:
     def _result(
         self, placed: TrackedFrame, inliers: int = 0, *, reason: str = "", revised: bool = False
     ) -> TrackingResult:
-        place, pose = placed.place, placed.place.pose
-        if not place.aligned and not reason:
+        pose = placed.pose
+        if not placed.aligned and not reason:
             moved = len(self._map.keyframes) > 1 or placed.keyframe
             reason = "the first keyframes are being aligned" if moved else "the camera has not moved far enough yet"
             if self._map.has_plane:
                 reason = "it is not linked with the map yet"
-        elif place.aligned and pose is None:
+        elif placed.aligned and pose is None:
             reason = "the model has no metric poses"
         return replace(
             self._unplaced(placed.frame, reason),
-            placement=place.placement if place.aligned else None,
+            placement=placed.placement if placed.aligned else None,
             keyframe=placed.keyframe,
             inliers=inliers,
             revised=revised,
-            quality=place.quality,
+            quality=placed.quality,
             covariance=None if pose is None else self._knowledge.covariance(placed, pose),
         )
 

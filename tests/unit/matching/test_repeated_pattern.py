@@ -85,6 +85,13 @@ def _still(moved: FloatArray, image1: int = 0, image2: int = 1) -> PairRegistrat
     return PairRegistration(image1, image2, StoredMatches.of(matched), relation)
 
 
+def _numbered(points: FloatArray, lens: Camera = LENS) -> Features:
+    """Features that all look alike, and whose scales are their numbers."""
+    one, numbers = np.ones(len(points)), np.arange(float(len(points)))
+    descriptors = np.zeros((len(points), 8), np.float32)
+    return Features(points, descriptors, numbers, one, one, None, "made up", lens.image_size)
+
+
 def _failed(image1: int, image2: int) -> PairRegistration:
     pair = _still(np.zeros(10), image1, image2)
     return PairRegistration(image1, image2, pair.matches, RadialHomography.failed("no", LENS, LENS, 10))
@@ -106,11 +113,7 @@ def test_only_inliers_decide_and_no_failed_pair_is_static() -> None:
 
 def test_what_moves_by_less_than_the_threshold_is_taken_out_of_static_pairs_only() -> None:
     count = 40
-    one = np.ones(count)
-    numbers = np.arange(count, dtype=np.float64)
-    features = [
-        Features(np.zeros((count, 2)), np.zeros((count, 8), np.float32), numbers, one, one, None, "made up")
-    ] * 3
+    features = [_numbered(np.zeros((count, 2)))] * 3
     # Of the static pair, ten matches move by more than the threshold.
     moved = np.append(np.zeros(28), [2.9, 2.9, *[3.1] * 5, *[50.0] * 5])
     pairs = [_still(moved), _still(np.full(count, 30.0), 1, 2), _failed(0, 2)]
@@ -141,21 +144,6 @@ def test_motion_is_shown_by_a_connected_good_part(links: list[tuple[int, int]], 
     assert show_motion(pairs, count, THRESHOLD) is shown
 
 
-def _overlaid(static: int, image1: int = 0, image2: int = 1) -> PairRegistration:
-    """A pair that moves, with some static matches that are no inliers."""
-    pair = _still(np.append(np.full(40, 30.0), np.zeros(static)), image1, image2)
-    pair.relation.inliers[40:] = False
-    return pair
-
-
-def test_static_matches_besides_motion_are_a_background_where_several_pairs_have_them() -> None:
-    move = _still(np.full(40, 30.0))
-    assert has_static_background([_overlaid(8), _overlaid(8), move], THRESHOLD)
-    assert not has_static_background([_overlaid(7), _overlaid(7), move], THRESHOLD)
-    assert not has_static_background([_overlaid(8), move, move], THRESHOLD)
-    assert not has_static_background([_overlaid(8), _overlaid(8), *[move] * 9], THRESHOLD)
-
-
 def _with_overlay(static: int, image1: int = 0, image2: int = 1, *, seed: int = 0) -> PairRegistration:
     """A pair that moves by 30 pixels, with so many static outliers at the same places of every such pair."""
     pair = _still(np.append(np.full(40, 30.0), np.full(static, 0.2)), image1, image2)
@@ -164,9 +152,16 @@ def _with_overlay(static: int, image1: int = 0, image2: int = 1, *, seed: int = 
     return pair
 
 
+def test_static_matches_besides_motion_are_a_background_where_several_pairs_have_them() -> None:
+    move = _still(np.full(40, 30.0))
+    assert has_static_background([_with_overlay(8), _with_overlay(8), move], THRESHOLD)
+    assert not has_static_background([_with_overlay(7), _with_overlay(7), move], THRESHOLD)
+    assert not has_static_background([_with_overlay(8), move, move], THRESHOLD)
+    assert not has_static_background([_with_overlay(8), _with_overlay(8), *[move] * 9], THRESHOLD)
+
+
 def test_of_a_pair_that_moves_only_static_outliers_are_taken_out() -> None:
-    one, numbers = np.ones(48), np.arange(48.0)
-    features = [Features(np.zeros((48, 2)), np.zeros((48, 8), np.float32), numbers, one, one, None, "made up")] * 2
+    features = [_numbered(np.zeros((48, 2)))] * 2
     first, second = moving_features(FeatureStore.of(features), [_with_overlay(8)], THRESHOLD)
     assert first.scale.tolist() == list(range(40))
     assert second.scale.tolist() == list(range(8, 48))
@@ -176,9 +171,9 @@ def test_of_a_pair_that_moves_only_static_outliers_are_taken_out() -> None:
 def test_a_place_is_static_from_three_static_matches_on(pairs: int, left: int) -> None:
     """Of an image of which no pair was estimated."""
     seen = [_with_overlay(8, 0, 1 + k, seed=k) for k in range(pairs)]
-    one, points = np.ones(48), seen[0].correspondences.points1.copy()
+    points = seen[0].correspondences.points1.copy()
     points[40:] += (0.6, 0.7)  # nearer than a static match moves
-    features = [Features(points, np.zeros((48, 8), np.float32), one, one, one, None, "made up", LENS.image_size)] * 6
+    features = [_numbered(points)] * 6
     assert len(moving_features(FeatureStore.of(features), seen, THRESHOLD)[5]) == left
 
 
@@ -186,11 +181,7 @@ def test_a_place_is_static_in_images_of_the_same_size_only() -> None:
     small = [_still(np.zeros(40), *images) for images in ((0, 1), (1, 2), (0, 2))]
     large, seen = Camera((4000, 3000)), _still(np.full(40, 30.0), 3, 4)
     pairs = [*small, replace(seen, relation=replace(seen.relation, camera=large, camera2=large))]
-    one, points = np.ones(40), seen.correspondences.points1
-    features = [
-        Features(points, np.zeros((40, 8), np.float32), one, one, one, None, "made up", lens.image_size)
-        for lens in (LENS, LENS, LENS, large, large)
-    ]
+    features = [_numbered(seen.correspondences.points1, lens) for lens in (LENS, LENS, LENS, large, large)]
     assert [len(left) for left in moving_features(FeatureStore.of(features), pairs, THRESHOLD)] == [0, 0, 0, 40, 40]
 
 

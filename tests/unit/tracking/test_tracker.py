@@ -38,7 +38,7 @@ from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.map_refinement import MapRefinement
 from rdstitch.tracking.metric_plane import MetricPlane
 from rdstitch.tracking.odometry_prediction import OdometryPrediction
-from rdstitch.tracking.tracked_frame import Frame, FramePlace, TrackedFrame
+from rdstitch.tracking.tracked_frame import Frame, TrackedFrame
 
 SIZE = (320, 240)
 DISTORTION = -0.25
@@ -274,12 +274,12 @@ def test_where_no_homography_fits_frames_are_lost_and_keyframes_stay(
     assert [result.placement for result in later] == [None, None, None]
     assert [keyframe.number for keyframe in tracker._map.keyframes] == numbers
     # Keyframes by odometry have no links either: their lengths change all the same.
-    before = [keyframe.place.pose for keyframe in tracker._map.keyframes[1:]]
+    before = [keyframe.pose for keyframe in tracker._map.keyframes[1:]]
     tracker._map.rescale(1.1)
-    after = [keyframe.place.pose for keyframe in tracker._map.keyframes[1:]]
+    after = [keyframe.pose for keyframe in tracker._map.keyframes[1:]]
     tracker._map.links = []
     tracker._map.rescale(1.1)
-    again = [keyframe.place.pose for keyframe in tracker._map.keyframes[1:]]
+    again = [keyframe.pose for keyframe in tracker._map.keyframes[1:]]
     for scale, poses in ((1.1, after), (1.21, again)):
         np.testing.assert_allclose([p.x for p in poses], [scale * p.x for p in before], rtol=1e-9)
 
@@ -306,14 +306,12 @@ def _placed(x: float, y: float, yaw: float, height: float, tilt: tuple[float, fl
     return Placement(Camera((640, 480), -0.2), 3.0 * np.linalg.inv(projection), f)
 
 
-def _keyframe(number: int, place: FramePlace | None = None) -> TrackedFrame:
+def _keyframe(number: int, placement: Placement | None = None) -> TrackedFrame:
     """Of a camera with a given focal length, on a body that moves ahead."""
     camera = Camera((640, 480), -0.2, focal=1.3 * 400.0, focal_source="option")
     image = prepare(View(np.zeros((480, 640), dtype=np.uint8)), None)
     frame = Frame(number, camera, image, MADE_UP.__getitem__, body=BodyPose(0.5 * number, 0.0, 0.0))
-    return TrackedFrame(
-        frame, place or FramePlace(_placed(number, 0.0, 0.0, 1.0), True, np.zeros((4, 4))), keyframe=True
-    )
+    return TrackedFrame(frame, placement or _placed(number, 0.0, 0.0, 1.0), True, np.zeros((4, 4)), keyframe=True)
 
 
 def _given_camera() -> CameraKnowledge:
@@ -326,10 +324,9 @@ def test_keyframes_by_odometry_are_no_measurement_of_it() -> None:
     rng, odometry, keyframes, fits = np.random.default_rng(0), OdometryPrediction(), [], []
     for number in range(30):
         x, y = rng.normal((number, 0.0), 0.05)
-        place = FramePlace(_placed(x, y, 0.0, 1.0), True, np.zeros((4, 4)))
+        keyframes.append(_keyframe(number, _placed(x, y, 0.0, 1.0)))
         if number >= 8:
-            place = odometry.place(_keyframe(number).frame, _given_camera())
-        keyframes.append(_keyframe(number, place))
+            keyframes[-1].move_to(odometry.place(keyframes[-1].frame, _given_camera()))
         odometry.latest = keyframes[-1]
         odometry.learn(keyframes)
         fits.append(odometry.mounted)
