@@ -1,8 +1,8 @@
 """What the caller of the alignment decides, and what is given of the camera and the images."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import get_args
 
 import numpy as np
@@ -108,6 +108,10 @@ class GivenImages:
     cameras: Sequence[Camera]
     links: Sequence[Link]
     options: AlignmentOptions
+    # Images that show next to nothing but what another one does, each with that one, and their links: they are placed
+    # by these when all the rest is known
+    near_copies: Mapping[int, int] = field(default_factory=dict)
+    links_of_copies: Sequence[Link] = ()
 
 
 def _of_images(name: str, given: ArrayLike | None, shape: tuple[int, ...], missing: float = math.nan) -> FloatArray:

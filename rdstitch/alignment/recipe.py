@@ -187,7 +187,7 @@ def _with_checked_focal(adjusted: AdjustedImages, stated: AlignmentOptions) -> A
     options = replace(given.options, tilt=None) if only_tilt else given.options
 
     def by_themselves(options: AlignmentOptions) -> tuple[AdjustedImages, Message | None]:
-        free = _adjusted(_lens_and_model(GivenImages(cameras, given.links, options)))
+        free = _adjusted(_lens_and_model(replace(given, cameras=cameras, options=options)))
         return free, check_focal(given.cameras[free.images[0]], free.choice.fit, free.covariance)
 
     try:

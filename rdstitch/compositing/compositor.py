@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.compositing.canvas import Canvas
-from rdstitch.compositing.photo_sphere import photo_sphere_xmp
 from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.preparation import Decisions, decide, prepare_composite
+from rdstitch.compositing.projection import TURN
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.source_images import PlacedImage
-from rdstitch.compositing.tiles import BlockRunner
+from rdstitch.compositing.tiles import BlockRunner, strips_of
 from rdstitch.io.formats import check_format, check_memory
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.strips import ImageSpec
@@ -65,17 +65,17 @@ def compose_decided(
 
     ``elsewhere`` computes the pixels in blocks, in other processes; see :mod:`rdstitch.compositing.tiles`.
     """
-    with prepare_composite(decisions, elsewhere) as prepared:
-        renderer, (width, height) = prepared.renderer, prepared.canvas.size
+    with prepare_composite(decisions, here=elsewhere is None) as tiles:
+        renderer, (width, height) = tiles.renderer, tiles.size
         pixels = np.zeros((height, width, renderer.channels), dtype=renderer.dtype)
         alpha = np.zeros((height, width), dtype=np.uint8)
         top = 0
-        with closing(prepared.strips(progress)) as strips:
+        with closing(strips_of(tiles, elsewhere, progress)) as strips:
             for samples, opaque in strips:
                 pixels[top : top + len(samples)], alpha[top : top + len(samples)] = samples, opaque
                 top += len(samples)
     shaped = pixels if renderer.channels > 1 else pixels[..., 0]
-    return Composite(shaped, alpha, prepared.canvas, renderer.exposure, prepared.messages)
+    return Composite(shaped, alpha, decisions.canvas, renderer.exposure, decisions.messages)
 
 
 def compose_to_file(
@@ -93,22 +93,53 @@ def compose_to_file(
     ``extra_tags`` gives further tags of a TIFF file for the canvas after cropping; without ``outputs`` the file
     replaces what is there.
     """
-    with prepare_composite(decisions, elsewhere) as prepared:
-        renderer, size = prepared.renderer, prepared.canvas.size
+    with prepare_composite(decisions, here=elsewhere is None) as tiles:
+        renderer, canvas, size = tiles.renderer, decisions.canvas, tiles.size
         layout = ImageSpec(
             size,
             renderer.channels,
             renderer.dtype,
             transparent=True,
-            metadata=replace(metadata or Metadata(size), xmp=photo_sphere_xmp(prepared.canvas)),
+            metadata=replace(metadata or Metadata(size), xmp=photo_sphere_xmp(canvas)),
             quality=renderer.options.quality,
             background=renderer.options.background,
         )
         check_format(path, layout)
         check_memory(path, size, renderer.options.max_memory)
         # Nothing goes on behind a writer that fails.
-        with closing(prepared.strips(progress)) as strips:
-            tags, workers = extra_tags(prepared.canvas), prepared.tiles.workers
+        with closing(strips_of(tiles, elsewhere, progress)) as strips:
+            tags, workers = extra_tags(canvas), tiles.workers
             written, notes = write_strips(path, layout, strips, tags, outputs=outputs, workers=workers)
-    messages = (*prepared.messages, *notes)
-    return FileComposite(prepared.canvas, written, messages, renderer.seams, prepared.tiles.box[:2])
+    return FileComposite(canvas, written, (*decisions.messages, *notes), renderer.seams, tiles.box[:2])
+
+
+def photo_sphere_xmp(canvas: Canvas) -> bytes:
+    """XMP packet (GPano) by which viewers recognize an equirectangular image and turn it; empty for others.
+
+    The metadata of Google's Photo Sphere, which also describes images that are only a part of the sphere.
+    """
+    upright = canvas.matrix[0, 1] == 0.0 and canvas.matrix[1, 0] == 0.0
+    if canvas.projection.name != "sphere" or not upright:
+        return b""
+    resolution = float(canvas.matrix[0, 0])
+    full_width, full_height = round(TURN * resolution), round(TURN * resolution / 2.0)
+    origin = canvas.matrix[:2, 2] + 0.5
+    width, height = canvas.size
+    left = 0 if canvas.period is not None else min(max(round(full_width / 2 - origin[0]), 0), full_width - width)
+    top = min(max(round(full_height / 2 - origin[1]), 0), full_height - height)
+    numbers = {
+        "FullPanoWidthPixels": full_width,
+        "FullPanoHeightPixels": full_height,
+        "CroppedAreaLeftPixels": left,
+        "CroppedAreaTopPixels": top,
+        "CroppedAreaImageWidthPixels": width,
+        "CroppedAreaImageHeightPixels": height,
+    }
+    attributes = " ".join(f'GPano:{name}="{number}"' for name, number in numbers.items())
+    return (
+        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>'
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        '<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" '
+        f'GPano:ProjectionType="equirectangular" GPano:UsePanoramaViewer="True" {attributes}/>'
+        '</rdf:RDF></x:xmpmeta><?xpacket end="w"?>'
+    ).encode()

@@ -1,6 +1,6 @@
 """From what is decided on small images, exposure, seams and crop, to strips of the output at full size."""
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -21,33 +21,15 @@ from rdstitch.compositing.seam_finder import SeamMap, find_seams
 from rdstitch.compositing.seam_quality import SeamQuality
 from rdstitch.compositing.source_images import ImageReader, PlacedImage
 from rdstitch.compositing.survey import Survey, survey_factor, survey_images
-from rdstitch.compositing.tiles import BlockRunner, OutputStrip, TiledOutput, strips_of_blocks
+from rdstitch.compositing.tiles import TiledOutput
 from rdstitch.compositing.warp import plan_warps
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.results.messages import Message
 from rdstitch.system.process_memory import return_freed_memory
-from rdstitch.system.progress import ShareProgress, unheard
 
 # Images that the survey reads at one time: what the tiles need is not there yet.
 _READERS = 2
-
-
-@dataclass(frozen=True, eq=False)
-class Prepared:
-    """A composite that is decided on, and not yet computed."""
-
-    renderer: Renderer
-    canvas: Canvas  # after cropping
-    tiles: TiledOutput  # its pixels; their box is on the canvas of the renderer, before cropping
-    messages: tuple[Message, ...]
-    elsewhere: BlockRunner | None = None  # computes the pixels in blocks, see :mod:`rdstitch.compositing.tiles`
-
-    def strips(self, progress: ShareProgress = unheard) -> Generator[OutputStrip]:
-        """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
-        if self.elsewhere is None:
-            return self.tiles.strips(progress)
-        return strips_of_blocks(self.tiles, self.elsewhere, progress)
 
 
 @dataclass(frozen=True)
@@ -70,9 +52,12 @@ class _Task:
         cameras = [image.camera for image in images]
         masked = reader.masked(0) or any(image.transparent for image in images)
         plan = plan_composite(cameras, canvas, options, channels, dtype.itemsize, masked=masked)
-        if canvas.period is not None:
-            canvas = canvas.widened(_wrap_margin(canvas, plan.bands))
-        return cls(images, canvas, options, reader, plan, _unwidened(canvas))
+        if canvas.period is None:
+            return cls(images, canvas, options, reader, plan, None)
+        (width, height), around = canvas.size, round(canvas.period)
+        needed = _wrap_margin(canvas, plan.bands)
+        left = needed + (width - around) // 2
+        return cls(images, canvas.widened(needed), options, reader, plan, (left, 0, left + around, height))
 
 
 @dataclass(frozen=True)
@@ -95,40 +80,8 @@ class Decisions:
 
 def decide(images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOptions) -> Decisions:
     """Decide on exposure, seams and cropping, from a small version of each image; the canvas was planned for them."""
-    return _decided(_Task.of(images, canvas, options))
-
-
-def planned(images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOptions) -> CompositePlan:
-    """What compositing would take; a small version of the first image is read."""
-    return _Task.of(images, canvas, options).plan
-
-
-@contextmanager
-def prepare_composite(decisions: Decisions, elsewhere: BlockRunner | None = None) -> Iterator[Prepared]:
-    """Everything that is needed to compute the output; see :func:`rdstitch.compositing.compositor.compose_decided`.
-
-    Images are read ahead as long as it lasts, if they are needed here.
-    """
-    task, plan = decisions.task, decisions.task.plan
-    warps, (channels, dtype) = plan_warps(task.images, task.canvas), task.reader.samples
-    cache = ImageCache(
-        task.reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1 and elsewhere is None
-    )
-    with closing(cache):
-        return_freed_memory()
-        # The first tiles need most of them, however the seams run.
-        topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
-        cache.prefetch(sorted(topmost, key=lambda index: warps[index].box))
-        renderer = Renderer(
-            warps, cache, decisions.exposure, decisions.seams, task.options, plan.bands, channels, dtype
-        )
-        tiles = TiledOutput(renderer, decisions.box, plan.tile_size, plan.workers)
-        yield Prepared(renderer, decisions.canvas, tiles, decisions.messages, elsewhere)
-
-
-def _decided(task: _Task) -> Decisions:
-    """Everything that small images say."""
-    options, whole = task.options, task.turn or (0, 0, *task.canvas.size)
+    task = _Task.of(images, canvas, options)
+    whole = task.turn or (0, 0, *task.canvas.size)
     joined = len(task.images) > 1 and (options.exposure != "none" or options.seam != "none")
     exposure, seams = no_exposure(len(task.images), task.reader.samples[0]), None
     if not joined and options.crop != "auto":
@@ -140,10 +93,36 @@ def _decided(task: _Task) -> Decisions:
     if joined and options.seam != "none":
         seams, quality = _decide_seams(task, survey, exposure)
     if options.crop == "auto" and cropped is None:
-        cropped, note = _decide_crop(task, survey)
+        find = crop_box if task.turn is None else partial(crop_rows, whole=task.turn)
+        cropped, note = find(covered_pixels(survey), survey.factor, task.canvas.size)
         messages = [*messages, Message(note)] if note else messages
     box = cropped if cropped is not None and options.crop == "auto" else whole
     return Decisions(task, exposure, seams, box, tuple(messages), quality.cropped(box))
+
+
+def planned(images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOptions) -> CompositePlan:
+    """What compositing would take; a small version of the first image is read."""
+    return _Task.of(images, canvas, options).plan
+
+
+@contextmanager
+def prepare_composite(decisions: Decisions, *, here: bool = True) -> Iterator[TiledOutput]:
+    """The output that is to be computed; see :func:`rdstitch.compositing.compositor.compose_decided`.
+
+    Images are read ahead as long as it lasts, if its pixels are computed ``here``.
+    """
+    task, plan = decisions.task, decisions.task.plan
+    warps, (channels, dtype) = plan_warps(task.images, task.canvas), task.reader.samples
+    cache = ImageCache(task.reader, [w.shrink for w in warps], plan.cache_bytes, ahead=plan.workers > 1 and here)
+    with closing(cache):
+        return_freed_memory()
+        # The first tiles need most of them, however the seams run.
+        topmost = [index for index, warp in enumerate(warps) if warp.box[1] < plan.tile_size]
+        cache.prefetch(sorted(topmost, key=lambda index: warps[index].box))
+        renderer = Renderer(
+            warps, cache, decisions.exposure, decisions.seams, task.options, plan.bands, channels, dtype
+        )
+        yield TiledOutput(renderer, decisions.box, plan.tile_size, plan.workers)
 
 
 def _decide_exposure(task: _Task, survey: Survey) -> tuple[Exposure, list[Message]]:
@@ -166,12 +145,6 @@ def _decide_seams(task: _Task, survey: Survey, exposure: Exposure) -> tuple[Seam
     return seams, quality
 
 
-def _decide_crop(task: _Task, survey: Survey) -> tuple[Box | None, str]:
-    """What a crop leaves, None for everything, and what the user should know of it."""
-    find = crop_box if task.turn is None else partial(crop_rows, whole=task.turn)
-    return find(covered_pixels(survey), survey.factor, task.canvas.size)
-
-
 def _wrap_margin(canvas: Canvas, bands: int) -> int:
     """What a canvas that goes all the way round needs of its other end on each side, pixels, for blending to join them.
 
@@ -179,12 +152,3 @@ def _wrap_margin(canvas: Canvas, bands: int) -> int:
     """
     needed, unit = margin(bands) + (2 << bands), max(LATTICE_STEPS[0], 2 << bands, survey_factor(canvas))
     return min(-(-needed // unit) * unit, canvas.size[0] // unit * unit)
-
-
-def _unwidened(canvas: Canvas) -> Box | None:
-    """The middle of a canvas that was widened: one full turn; None for others."""
-    if canvas.period is None:
-        return None
-    (width, height), turn = canvas.size, round(canvas.period)
-    left = (width - turn) // 2
-    return left, 0, left + turn, height

@@ -16,7 +16,6 @@ from rdstitch.compositing.boxes import Box, Float32Array, cut
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.photometric import DEPTHS, full_scale
 from rdstitch.compositing.preparation import decide, prepare_composite
-from rdstitch.compositing.render import Layer
 from rdstitch.compositing.resample import INTERPOLATION, remap, sample_places
 from rdstitch.compositing.source_images import PlacedImage, block_side, smoothed
 from rdstitch.errors import ArgumentError
@@ -54,8 +53,8 @@ class CompositeTables:
         """
         blend = "feather" if options.blend == "multiband" else options.blend
         options = replace(options, blend=blend, crop="none")
-        with prepare_composite(decide(images, canvas, options)) as prepared:
-            renderer, box = prepared.renderer, prepared.tiles.box
+        with prepare_composite(decide(images, canvas, options)) as tiles:
+            renderer, box = tiles.renderer, tiles.box
             covered = np.zeros((box[3] - box[1], box[2] - box[0]), dtype=np.uint8)
             exposure, channels = renderer.exposure, renderer.channels
             offset = np.zeros((*covered.shape, channels), dtype=np.float32) if exposure.offset else None
@@ -66,7 +65,10 @@ class CompositeTables:
                 if offset is not None:
                     part = factors - layer.weight[..., None]
                     cut(offset, box, layer.box)[...] += part * np.float32(exposure.offset)
-                shares.append(_share(layer, box, factors))
+                (x, y), (x0, y0, x1, y1) = box[:2], layer.box
+                places = sample_places(block_side(layer.geometry.warp.shrink), layer.geometry)
+                within = (x0 - x, y0 - y, x1 - x, y1 - y)
+                shares.append(_Share(layer.index, within, places, layer.weight, factors))
             shrinks = tuple(warp.shrink for warp in renderer.warps)
             kernel = INTERPOLATION[options.interpolation]
             sizes = tuple(image.camera.image_size for image in images)
@@ -110,10 +112,3 @@ class CompositeTables:
             kind, first = (image.shape[2:], image.dtype), (images[0].shape[2:], images[0].dtype)
             if kind != first or image.dtype.name not in DEPTHS:
                 raise ArgumentError(f"image {number} has samples unlike the first, or not uint8, uint16 or float32")
-
-
-def _share(layer: Layer, box: Box, factors: Float32Array) -> _Share:
-    """The tables of a layer on a box of the canvas, in pixels of the box."""
-    warp, (x, y), (x0, y0, x1, y1) = layer.geometry.warp, box[:2], layer.box
-    places = sample_places(block_side(warp.shrink), layer.geometry)
-    return _Share(layer.index, (x0 - x, y0 - y, x1 - x, y1 - y), places, layer.weight, factors)

@@ -127,8 +127,12 @@ BlockRunner = Callable[[Iterable[Block]], Generator[list[Stored[OutputStrip]]]]
 """Computes blocks elsewhere: their strips, in the order of the blocks, which are taken as they are needed."""
 
 
-def strips_of_blocks(whole: TiledOutput, run: BlockRunner, progress: ShareProgress = unheard) -> Generator[OutputStrip]:
-    """The strips of an output (h, W, ...) that is computed in blocks; the same, bit for bit, as here."""
+def strips_of(whole: TiledOutput, elsewhere: BlockRunner | None, progress: ShareProgress) -> Generator[OutputStrip]:
+    """The strips of an output, which is computed here or in blocks elsewhere; the same, bit for bit."""
+    return whole.strips(progress) if elsewhere is None else _strips_of_blocks(whole, elsewhere, progress)
+
+
+def _strips_of_blocks(whole: TiledOutput, run: BlockRunner, progress: ShareProgress) -> Generator[OutputStrip]:
     (x0, y0, x1, y1), (width, height) = whole.box, _block_size(whole)
     lefts = range(x0, x1, width)
 

@@ -1,20 +1,28 @@
-"""Images of a result as layers for retouching: each warped, with its mask."""
+"""Images of a result as layers for retouching: each warped, with its mask, in TIFF files as enblend reads them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.compositing.boxes import intersection
 from rdstitch.compositing.preparation import decide, prepare_composite
 from rdstitch.errors import OutputError
-from rdstitch.io.cropped_tiff import write_cropped_tiff
 from rdstitch.io.samples import as_alpha
+from rdstitch.io.strips import with_alpha
+from rdstitch.io.tiff import ExtraTag
 from rdstitch.results.stitch_result import OutputImage
+from rdstitch.system.late_imports import tifffile
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, check_outputs, file_name
+
+_DPI = 150  # offsets are counted in inches; any resolution will do
+_X_POSITION, _Y_POSITION, _FULL_WIDTH, _FULL_LENGTH = 286, 287, 33300, 33301
+_RATIONAL, _LONG = 5, 4
 
 
 def layer_files(names: Sequence[str], folder: str | Path) -> dict[str, tuple[Path, Path]]:
@@ -70,19 +78,53 @@ def stage_layers(result: OutputImage, files: Mapping[str, tuple[Path, Path]], ou
     """Stage the layer and the mask of each image of a result, whose names say the files."""
     images = result.placed.images(result.canvas)
     task = decide(images, result.canvas, replace(result.options.composite, crop="none"))
-    with prepare_composite(task) as prepared:
-        canvas = prepared.tiles.box
+    with prepare_composite(task) as tiles:
+        canvas = tiles.box
         size = canvas[2] - canvas[0], canvas[3] - canvas[1]
-        for index, (source, warp) in enumerate(zip(result.placed.sources, prepared.renderer.warps, strict=True)):
+        for index, (source, warp) in enumerate(zip(result.placed.sources, tiles.renderer.warps, strict=True)):
             box = canvas if whole else intersection(warp.box, canvas) or canvas
-            samples, covered, mask = prepared.renderer.layer(index, box)
+            samples, covered, mask = tiles.renderer.layer(index, box)
             offset = box[0] - canvas[0], box[1] - canvas[1]
             shift = np.array([[1.0, 0.0, -offset[0]], [0.0, 1.0, -offset[1]], [0.0, 0.0, 1.0]])
             tags = () if result.georeference is None else result.georeference.after(shift).tiff_tags()
-            write = partial(write_cropped_tiff, offset=offset, size=size, extra_tags=tags)
+            write = partial(_write_cropped_tiff, offset=offset, size=size, extra_tags=tags)
             alpha, shown = (as_alpha(where) for where in (covered, mask))
             layer, mask_file = files[source.name]
             with outputs.writing(layer) as staged:
                 write(staged, samples, alpha)
             with outputs.writing(mask_file) as staged:
                 write(staged, shown, None)
+
+
+def _write_cropped_tiff(
+    path: Path,
+    pixels: NDArray[Any],
+    alpha: NDArray[np.uint8] | None,
+    offset: tuple[int, int],
+    size: tuple[int, int],
+    extra_tags: Sequence[ExtraTag] = (),
+) -> None:
+    """Write a part (h, w) or (h, w, C) of a canvas of ``size``, its first pixel at ``offset``; alpha is 0 or 255."""
+    samples = pixels[..., None] if pixels.ndim == 2 else pixels
+    colours = 3 if samples.shape[2] == 3 else 1
+    extra = ["unspecified"] * (samples.shape[2] - colours)
+    if alpha is not None:
+        samples, extra = with_alpha(samples, alpha), [*extra, "unassalpha"]
+    positions = [
+        (tag, _RATIONAL, 1, (at, _DPI), True) for tag, at in zip((_X_POSITION, _Y_POSITION), offset, strict=True)
+    ]
+    whole = [(tag, _LONG, 1, side, True) for tag, side in zip((_FULL_WIDTH, _FULL_LENGTH), size, strict=True)]
+    tifffile.imwrite(
+        path,
+        samples if extra else samples[..., 0] if colours == 1 else samples,
+        photometric="rgb" if colours == 3 else "minisblack",
+        planarconfig="contig",
+        extrasamples=extra or None,
+        compression="zlib",
+        predictor=samples.dtype.kind == "u",
+        resolution=(_DPI, _DPI),
+        resolutionunit="inch",
+        extratags=[*positions, *whole, *extra_tags],
+        metadata=None,
+        software=False,
+    )

@@ -87,8 +87,8 @@ class _TimedAttitudes:
     times: FloatArray  # (M,), s, ascending
     tilts: FloatArray  # (M, 2): (ψ, θ), radians
 
-    def time_of(self, source: Source, file: str | Path) -> float:
-        """When an image was taken, which must lie within the table."""
+    def at(self, source: Source, file: str | Path) -> FloatArray:
+        """(ψ, θ) (K, 2) of an image, whose time must lie within the table, at :data:`DELAYS` (K,), interpolated."""
         time = float(timestamps_of([source])[0])
         first, last = self.times[[0, -1]].tolist()
         beyond = float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
@@ -98,12 +98,7 @@ class _TimedAttitudes:
             raise InputError(
                 f"{file}: has attitudes from {first:.3f} to {last:.3f} s, not for {source.name}, {time:.3f} s"
             )
-        return time
-
-    def at(self, source: Source, file: str | Path) -> FloatArray:
-        """(ψ, θ) (K, 2) of an image at :data:`DELAYS` (K,), interpolated."""
-        times = self.time_of(source, file) + DELAYS
-        return np.stack([np.interp(times, self.times, values) for values in self.tilts.T], axis=1)
+        return np.stack([np.interp(time + DELAYS, self.times, values) for values in self.tilts.T], axis=1)
 
 
 @cached_by_file_state

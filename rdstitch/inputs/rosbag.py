@@ -29,24 +29,23 @@ _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _ODOMETRY = "nav_msgs/msg/Odometry"
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _WHITE = 0.999  # fraction of a frame's pixels of more than 8 bits up to which 8 bits reach
-_TYPES = {
-    **dict.fromkeys(("mono8", "8UC1", "rgb8", "bgr8", "8UC3", "rgba8", "bgra8", "8UC4"), np.uint8),
-    **dict.fromkeys(("mono16", "16UC1", "rgb16", "bgr16", "16UC3", "rgba16", "bgra16"), np.uint16),
-    **dict.fromkeys(("bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"), np.uint8),
-}
-_TO_BGR = {
-    "rgb8": cv2.COLOR_RGB2BGR,
-    "rgb16": cv2.COLOR_RGB2BGR,
-    "rgba8": cv2.COLOR_RGBA2BGR,
-    "rgba16": cv2.COLOR_RGBA2BGR,
-    "bgra8": cv2.COLOR_BGRA2BGR,
-    "bgra16": cv2.COLOR_BGRA2BGR,
-    "8UC4": cv2.COLOR_BGRA2BGR,
+# Of uncompressed images by their encoding: type and number of the samples, and what makes BGR of them.
+_ENCODINGS: dict[str, tuple[Any, int, int | None]] = {
+    **dict.fromkeys(("mono8", "8UC1"), (np.uint8, 1, None)),
+    **dict.fromkeys(("mono16", "16UC1"), (np.uint16, 1, None)),
+    **dict.fromkeys(("bgr8", "8UC3"), (np.uint8, 3, None)),
+    **dict.fromkeys(("bgr16", "16UC3"), (np.uint16, 3, None)),
+    "rgb8": (np.uint8, 3, cv2.COLOR_RGB2BGR),
+    "rgb16": (np.uint16, 3, cv2.COLOR_RGB2BGR),
+    "rgba8": (np.uint8, 4, cv2.COLOR_RGBA2BGR),
+    "rgba16": (np.uint16, 4, cv2.COLOR_RGBA2BGR),
+    **dict.fromkeys(("bgra8", "8UC4"), (np.uint8, 4, cv2.COLOR_BGRA2BGR)),
+    "bgra16": (np.uint16, 4, cv2.COLOR_BGRA2BGR),
     # OpenCV names a pattern by its second row.
-    "bayer_rggb8": cv2.COLOR_BayerBG2BGR,
-    "bayer_bggr8": cv2.COLOR_BayerRG2BGR,
-    "bayer_gbrg8": cv2.COLOR_BayerGR2BGR,
-    "bayer_grbg8": cv2.COLOR_BayerGB2BGR,
+    "bayer_rggb8": (np.uint8, 1, cv2.COLOR_BayerBG2BGR),
+    "bayer_bggr8": (np.uint8, 1, cv2.COLOR_BayerRG2BGR),
+    "bayer_gbrg8": (np.uint8, 1, cv2.COLOR_BayerGR2BGR),
+    "bayer_grbg8": (np.uint8, 1, cv2.COLOR_BayerGB2BGR),
 }
 
 
@@ -234,18 +233,13 @@ def _grey_of_compressed(data: NDArray[np.uint8]) -> NDArray[Any] | None:
 
 def _pixels(path: Path, message: Any) -> NDArray[Any]:
     """Samples of an uncompressed image, grey or BGR; rows may be padded, and bytes swapped."""
-    kind = _TYPES.get(message.encoding)
-    if kind is None:
-        known = ", ".join(_TYPES)
+    if message.encoding not in _ENCODINGS:
+        known = ", ".join(_ENCODINGS)
         raise InputError(f"{path}: images have the encoding {message.encoding}, which is none of {known}")
+    kind, channels, to_bgr = _ENCODINGS[message.encoding]
     dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     rows = np.asarray(message.data, dtype=np.uint8)[: message.height * message.step].reshape(message.height, -1)
-    channels = 1 if message.encoding.startswith(("mono", "bayer")) else None
-    samples = np.ascontiguousarray(rows).view(dtype).astype(kind)
-    if channels is None:
-        channels = {"1": 1, "3": 3, "4": 4}.get(message.encoding[-1] if "C" in message.encoding else "", 0)
-        channels = channels or (4 if "a" in message.encoding else 3)
-    samples = samples[:, : message.width * channels].reshape(message.height, message.width, channels)
-    code = _TO_BGR.get(message.encoding)
-    samples = samples[..., 0] if channels == 1 else samples
-    return samples if code is None else np.asarray(cv2.cvtColor(samples, code))
+    samples = np.ascontiguousarray(rows).view(dtype).astype(kind)[:, : message.width * channels]
+    if channels > 1:
+        samples = samples.reshape(message.height, message.width, channels)
+    return samples if to_bgr is None else np.asarray(cv2.cvtColor(samples, to_bgr))

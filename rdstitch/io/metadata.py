@@ -13,15 +13,17 @@ from rdstitch.geometry.exif_orientation import turned_size, turning_matrix
 from rdstitch.geometry.places import GpsPosition
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_text
 from rdstitch.io.colour import ink_transform
-from rdstitch.io.exif_edit import author_and_time, upright_exif, without_film_size
-from rdstitch.io.exif_tags import (
+from rdstitch.io.exif import (
     ORIENTATION,
+    author_and_time,
     exposure_of,
     focal_length,
     gps_position,
     orientation_of,
     tag_text,
     time_taken,
+    upright_exif,
+    without_film_size,
 )
 from rdstitch.io.ome import read_ome
 from rdstitch.io.opening import (
@@ -160,7 +162,8 @@ def metadata_of(image: Image.Image) -> Metadata:
     """Metadata of an image that Pillow has opened."""
     # First, since looking for EXIF at the end of a PNG file decodes it, and Pillow then forgets.
     bit_depth = stored_bits(image)
-    return _metadata(image.getexif(), image.info, image.size, bit_depth, _channels(image))
+    channels = (1 if is_grey(image) else 3) + is_transparent(image)
+    return _metadata(image.getexif(), image.info, image.size, bit_depth, channels)
 
 
 def _metadata(
@@ -207,11 +210,6 @@ def _colour_profile(profile: object) -> tuple[bytes, str]:
     if profile[_COLOUR_SPACE] == b"Lab ":
         return b"", ""
     return profile, ""
-
-
-def _channels(image: Image.Image) -> int:
-    """Samples per pixel of what it is decoded to, with alpha."""
-    return (1 if is_grey(image) else 3) + is_transparent(image)
 
 
 def is_transparent(image: Image.Image) -> bool:

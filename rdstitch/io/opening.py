@@ -31,7 +31,7 @@ RAW_SUFFIXES = frozenset(
     (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".nrw", ".iiq", ".3fr", ".erf")
 )
 """What TIFF readers see in raw files is their thumbnail."""
-
+_PACKAGES = ((HEIF_SUFFIXES, "pillow_heif"), (RAW_SUFFIXES, "rawpy"))
 
 # What Pillow, tifffile and OpenCV have been seen to raise on damaged files; warnings, where filters make them errors.
 _DAMAGE = (
@@ -98,7 +98,9 @@ def check_readable(path: Path) -> None:
         raise InputError(f"{path}: is not a regular file; copy it to one first")
     if size == 0:
         raise InputError(f"{path}: is empty (0 bytes); copy it again from its source")
-    _check_reader(path)
+    for suffixes, package in _PACKAGES:
+        if path.suffix.lower() in suffixes:
+            reader_package(package, path)
     if not remote and not os.access(path, os.R_OK):
         raise InputError(f"{path}: permission denied; make it readable")
 
@@ -196,7 +198,10 @@ def _factory(file: Path, stream: BinaryIO) -> Factory:
             return _imported(reader)
     if beginning[4:8] == b"ftyp":
         if beginning[8:12] in (b"avif", b"avis"):
-            return _avif_factory(file)
+            try:
+                return _imported("PIL.AvifImagePlugin.AvifImageFile")
+            except ImportError:
+                raise InputError(f"{file}: AVIF needs Pillow 11.3 or newer; or convert it to JPEG or TIFF") from None
         # No opener is registered with Pillow, since that would be for the whole process.
         heif: Factory = reader_package("pillow_heif", file).HeifImageFile
         return heif
@@ -205,24 +210,10 @@ def _factory(file: Path, stream: BinaryIO) -> Factory:
     raise InputError(f"{file}: not an image in a supported format: {_NAMES}")
 
 
-def _check_reader(path: Path) -> None:
-    """Refuse a file whose reader is not installed."""
-    for suffixes, package in ((HEIF_SUFFIXES, "pillow_heif"), (RAW_SUFFIXES, "rawpy")):
-        if path.suffix.lower() in suffixes:
-            reader_package(package, path)
-
-
 def _imported(name: str) -> Factory:
     module, _, attribute = name.rpartition(".")
     factory: Factory = getattr(import_module(module), attribute)
     return factory
-
-
-def _avif_factory(path: Path) -> Factory:
-    try:
-        return _imported("PIL.AvifImagePlugin.AvifImageFile")
-    except ImportError:
-        raise InputError(f"{path}: AVIF needs Pillow 11.3 or newer; or convert it to JPEG or TIFF") from None
 
 
 def is_raw(path: Path) -> bool:

@@ -1,11 +1,13 @@
 """Reading an image: any common file to an array in RGB order, upright, with its alpha and metadata."""
 
 import math
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import simplejpeg
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -15,7 +17,6 @@ from rdstitch.io.colour import without_inks
 from rdstitch.io.metadata import GREY_16, Metadata, is_grey, is_transparent, metadata_of, read_metadata
 from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image
 from rdstitch.io.raw import read_raw
-from rdstitch.io.read_jpeg import decoded_jpeg, most_bytes
 from rdstitch.io.read_tiff import as_opacity, first_image_pages, read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME, as_alpha
@@ -24,6 +25,9 @@ from rdstitch.system.late_imports import imagecodecs, tifffile
 
 _MAX_DECODED_REDUCTION = 8  # of the JPEG decoder
 _JPEG = ("JPEG", "MPO")
+_END_OF_IMAGE = b"\xff\xd9"
+_PADDING = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
+_MIN_SIDE = 8  # pixels of a JPEG image; below, different reductions give images of the same size
 
 Pixels = NDArray[Any]
 
@@ -73,7 +77,7 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
                 metadata = metadata or metadata_of(opened)
                 if magic == PNG_MAGIC and metadata.bit_depth == 16 and opened.mode not in GREY_16:
                     # Pillow would cut 16-bit colour to 8.
-                    samples, alpha = _split(imagecodecs.png_decode(read_beginning(file, most_bytes(opened.size))))
+                    samples, alpha = _split(imagecodecs.png_decode(read_beginning(file, _most_bytes(opened.size))))
                 else:
                     factor, decoded = _decoders_share(opened, metadata, reduction), None
                     if opened.format in _JPEG and opened.mode in ("L", "RGB"):
@@ -89,6 +93,40 @@ def reduced(image: DecodedImage, factor: int) -> DecodedImage:
         return image
     alpha = None if image.alpha is None else block_minimum(image.alpha, factor)
     return replace(image, pixels=block_mean(image.pixels, factor), alpha=alpha)
+
+
+def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) -> tuple[Pixels | None, str]:
+    """Samples of 1/``factor`` of the size, (h, w) or (h, w, 3) in RGB order as stored, and what is wrong with the file.
+
+    What Pillow would decode, bit for bit, in less time and memory. Pillow has the last word on files about which
+    the decoder has any complaint: it refuses some, and decodes others without a word, whatever comes out. Then, and
+    where the file has no such reduction or is tiny, there are no samples; complaints that say nothing of the pixels
+    are empty.
+    """
+    if min(size) < _MIN_SIDE:
+        return None, ""
+    width, height = reduced_size(size, factor)
+    data = read_beginning(file, _most_bytes(size))
+    try:
+        samples = simplejpeg.decode_jpeg(
+            data, "GRAY" if grey else "RGB", min_height=height, min_width=width, strict=True
+        )
+    except ValueError as error:
+        return None, "" if _is_padding(str(error), data) else str(error)
+    whole: Pixels = np.asarray(samples)[..., 0] if grey else np.asarray(samples)
+    return (whole if whole.shape[:2] == (height, width) else None), ""
+
+
+def _most_bytes(size: tuple[int, int]) -> int:
+    """How much of a file an image can take, with what stands before it; a video may follow, or a hole without end."""
+    return 2**26 + 16 * size[0] * size[1]
+
+
+def _is_padding(complaint: str, data: bytes) -> bool:
+    """Check whether the decoder only complains of zeros before the end, as some cameras write them."""
+    padding = _PADDING.search(complaint)
+    end = data.rfind(_END_OF_IMAGE)
+    return padding is not None and not data[max(0, end - int(padding[1])) : end].strip(b"\0\xff")
 
 
 def _decoders_share(image: Image.Image, metadata: Metadata, reduction: int) -> int:

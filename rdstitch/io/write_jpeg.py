@@ -79,20 +79,28 @@ def _jpeg(spec: ImageSpec, samples: NDArray[np.generic], alpha: NDArray[np.uint8
 
 def _header_and_scan(data: bytes) -> tuple[bytes, memoryview]:
     """Everything up to the scan, and the scan without the end marker."""
-    position = 2
-    while data[position + 1] != _START_OF_SCAN:
-        position += 2 + struct.unpack_from(">H", data, position + 2)[0]
-    position += 2 + struct.unpack_from(">H", data, position + 2)[0]
+    position = _segment_end(data, _segment_of(data, _START_OF_SCAN))
     return data[:position], memoryview(data)[position : -len(_END_OF_IMAGE)]
 
 
 def _with_height(head: bytes, height: int) -> bytes:
     """The header with the height of the whole image instead of the first strip's."""
-    position = 2
-    while head[position + 1] != _START_OF_FRAME:
-        position += 2 + struct.unpack_from(">H", head, position + 2)[0]
+    position = _segment_of(head, _START_OF_FRAME)
     # Marker (2), length (2), precision (1), then the height.
     return head[: position + 5] + struct.pack(">H", height) + head[position + 7 :]
+
+
+def _segment_of(data: bytes, marker: int) -> int:
+    """Where a header's segment with a marker begins."""
+    position = 2
+    while data[position + 1] != marker:
+        position = _segment_end(data, position)
+    return position
+
+
+def _segment_end(data: bytes, position: int) -> int:
+    end: int = position + 2 + struct.unpack_from(">H", data, position + 2)[0]
+    return end
 
 
 def _embedded(head: bytes, metadata: Metadata) -> list[bytes]:
@@ -103,7 +111,7 @@ def _embedded(head: bytes, metadata: Metadata) -> list[bytes]:
     after_header = 2
     jfif = b""
     if head[3] == _JFIF:
-        after_header = 4 + struct.unpack_from(">H", head, 4)[0]
+        after_header = _segment_end(head, after_header)
         jfif = head[2:after_header]
         if metadata.resolution is not None and max(metadata.resolution) < 65535:
             jfif = jfif[:11] + struct.pack(">BHH", 1, *(round(d) for d in metadata.resolution)) + jfif[16:]

@@ -1,4 +1,4 @@
-"""Images that are there twice: the same pixels, saved again, or taken again by a camera that stood still.
+"""Images that are there twice: the same pixels, saved again, or taken again by a camera that hardly moved.
 
 They are no evidence: what an image shows counts once, however often it is given.
 """
@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import border_of
 from rdstitch.geometry.radial_homography import transfer
 from rdstitch.matching.two_view import Pair, PairRegistration
@@ -15,14 +16,34 @@ _SAME_PX = 0.5
 """Pixels that matches of a copy move by at most: saving again moves them by less, and no place is off by more."""
 
 _MIN_SAME = 0.9  # share of the matches that do: of an image that shows something else beside what is static, more move
+_NEAR = 0.02  # of the width and the height, that matches of a near copy move by at most: an overlap of 98 %
 
 
 def copies_of(pairs: Sequence[PairRegistration]) -> dict[int, int]:
     """Of each image that is a copy, by its index, the first image that it is a copy of."""
     result: dict[int, int] = {}
     for pair in sorted(pairs, key=lambda pair: pair.images):
-        if not {*pair.images} & result.keys() and _is_copy(pair):
+        if not {*pair.images} & result.keys() and _moves_within(pair, np.full(2, _SAME_PX)):
             result[pair.image2] = pair.image1
+    return result
+
+
+def near_copies_of(pairs: Mapping[Pair, PairRegistration]) -> dict[int, int]:
+    """Of each image that shows next to nothing but what another one does, that one; registered pairs by their images.
+
+    Whatever it overlaps with, so does that one: else it may be the only one that joins some images.
+    """
+    neighbours: dict[int, set[int]] = {}
+    for i, j in pairs:
+        neighbours.setdefault(i, set()).add(j)
+        neighbours.setdefault(j, set()).add(i)
+    result: dict[int, int] = {}
+    for first, copy in sorted((min(ends), max(ends)) for ends in pairs):
+        if {first, copy} & result.keys() or neighbours[copy] - {first} - neighbours[first]:
+            continue
+        pair = pairs[(first, copy) if (first, copy) in pairs else (copy, first)]
+        if _moves_within(pair, _NEAR * np.array(pair.relation.camera.image_size)):
+            result[copy] = first
     return result
 
 
@@ -39,15 +60,15 @@ def distinct(pairs: Sequence[PairRegistration], copies: Mapping[int, int]) -> di
     return result
 
 
-def _is_copy(pair: PairRegistration) -> bool:
-    """Whether both images show the same at the same pixels, by the corners first: most pairs are told by these."""
+def _moves_within(pair: PairRegistration, limits: FloatArray) -> bool:
+    """Whether what both show moves by at most so many pixels (2,), by the corners first: they tell most pairs."""
     relation = pair.relation
     if not relation or relation.camera.image_size != relation.camera2.image_size:
         return False
     corners = relation.camera.normalize(border_of(relation.camera.image_size, 1))
     with np.errstate(all="ignore"):
         moved = transfer(relation.homography, relation.distortion, corners, relation.camera.higher) - corners
-    if not (np.linalg.norm(moved, axis=1) * relation.camera.scale < 2.0 * _SAME_PX).all():
+    if not (np.linalg.norm(moved * relation.camera.scale / limits, axis=1) < 2.0).all():
         return False
     matches = pair.correspondences
-    return bool(np.mean(np.linalg.norm(matches.points2 - matches.points1, axis=1) < _SAME_PX) >= _MIN_SAME)
+    return bool(np.mean(np.linalg.norm((matches.points2 - matches.points1) / limits, axis=1) < 1.0) >= _MIN_SAME)

@@ -1,6 +1,6 @@
 """Stages: registered pairs become one alignment, which finds more pairs, which make a better alignment."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Self
@@ -15,7 +15,7 @@ from rdstitch.errors import ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import loop_closures
-from rdstitch.matching.copies import copies_of, distinct
+from rdstitch.matching.copies import copies_of, distinct, near_copies_of
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
@@ -148,21 +148,27 @@ class Aligner:
         if not related:  # all images show the same
             copies = {}
             related = distinct(pairs, copies)
-        most, stored = most_matches_read(len(related), self.options), self._quarters.back
+        reference = self.options.reference
+        near = {copy: first for copy, first in near_copies_of(related).items() if copy != reference}
+        evidence = [ends for ends in related if not near.keys() & {*ends}]
+        if not evidence:
+            near, evidence = {}, [*related]
+        ends = [*evidence, *(ends for ends in related if near.keys() & {*ends})]
+        most, stored = most_matches_read(len(evidence), self.options), self._quarters.back
         cameras = tuple(stored.camera(camera, k) for k, camera in enumerate(self.cameras))
-        named = (replace(pair.link().thinned(most), image1=i, image2=j) for (i, j), pair in related.items())
+        named = (replace(related[i, j].link().thinned(most), image1=i, image2=j) for i, j in ends)
         links = tuple(stored.link(link, self.cameras) for link in named)
         if (size := common_size(cameras, links)) is not None:
             cameras = tuple(framed_camera(camera, size) for camera in cameras)
             links = tuple(framed_link(link, size) for link in links)
-        reference = self.options.reference
         options = replace(self.options, reference=None if reference is None else copies.get(reference, reference))
-        task = AlignmentTask(cameras, links, options)
-        ends = [pair.images for pair in related.values()]
+        task = AlignmentTask(cameras, links[: len(evidence)], options, near, links[len(evidence) :])
+        compared, twice = [related[pair].images for pair in evidence], copies | near
 
         def complete(stage: str, compute: Callable[[], Alignment]) -> Alignment:
             alignment = self._recalled(stage, task, compute)
-            return self._with_copies(alignment, copies, ends) if copies else alignment
+            alignment = alignment.with_copies(copies, compared)
+            return alignment.with_messages([self._counted_once(twice)] if twice else [])
 
         return AlignedPairs(
             tuple(pairs),
@@ -170,14 +176,15 @@ class Aligner:
             completed=lambda: complete("alignment", lambda: task.result),
         )
 
-    def _with_copies(self, alignment: Alignment, copies: Mapping[int, int], ends: Sequence[Pair]) -> Alignment:
-        names = shortened(names_of(self.paths[k] for k in sorted(copies)))
-        text = f"counted once, because they show the same as other images at the same pixels: {names}"
-        return alignment.with_copies(copies, ends).with_messages([Message(text, severity="detail", code="copies")])
+    def _counted_once(self, twice: Iterable[int]) -> Message:
+        names = shortened(names_of(self.paths[k] for k in sorted(twice)))
+        text = f"counted once, because they show next to nothing but what other images do: {names}"
+        return Message(text, severity="detail", code="copies")
 
     def _recalled(self, stage: str, task: AlignmentTask, compute: Callable[[], Alignment]) -> Alignment:
         """An alignment of the upright images; from an earlier run where the cache has it."""
-        inputs = (task.cameras, self.cache.digest(task.links), task.options)
+        of_links = (task.links, task.links_of_copies, sorted(task.near_copies.items()))
+        inputs = (task.cameras, self.cache.digest(of_links), task.options)
         alignment = self.cache.recall(stage, inputs, compute)
         sizes = [self._quarters.back.camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
         if any(camera.image_size != size for camera, size in zip(alignment.cameras, sizes, strict=True)):

@@ -14,7 +14,8 @@ from examples.worlds.compositing_scenes import Scene, place_images, render
 from rdstitch.compositing import CompositeOptions
 from rdstitch.compositing.blender import MultibandBlender, margin, rounding_constant
 from rdstitch.compositing.boxes import aligned, grown
-from rdstitch.compositing.preparation import Prepared, decide, prepare_composite
+from rdstitch.compositing.preparation import decide, prepare_composite
+from rdstitch.compositing.tiles import TiledOutput
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.synthetic.rendering import Photometry
 
@@ -30,7 +31,7 @@ def _scene(bits: int) -> Scene:
 
 
 @functools.cache
-def _prepared(blend: str, seam: str, bits: int) -> tuple[Prepared, NDArray[Any], NDArray[np.bool_]]:
+def _prepared(blend: str, seam: str, bits: int) -> tuple[TiledOutput, NDArray[Any], NDArray[np.bool_]]:
     """A composite, and all of it as one tile."""
     scene = _scene(bits)
     options = CompositeOptions(blend=blend, seam=seam, max_memory=2**28)  # type: ignore[arg-type]
@@ -44,7 +45,7 @@ def _prepared(blend: str, seam: str, bits: int) -> tuple[Prepared, NDArray[Any],
 @given(data=st.data())
 def test_any_box_is_a_part_of_the_whole(blend: str, seam: str, bits: int, data: st.DataObject) -> None:
     ready, whole, covered = _prepared(blend, seam, bits)
-    width, height = ready.canvas.size
+    width, height = ready.size
     x = data.draw(st.integers(0, width - 1))
     y = data.draw(st.integers(0, height - 1))
     box = (x, y, data.draw(st.integers(x + 1, width)), data.draw(st.integers(y + 1, height)))

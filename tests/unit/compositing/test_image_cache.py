@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from threading import Event, Timer
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -49,11 +50,15 @@ class DecodedImageCache:
         return ImageCache(reader, [1.0] * 4, limit, ahead=ahead)
 
 
-@pytest.mark.parametrize("writable", [True, False])
+@pytest.mark.parametrize("disk", ["writable", "missing", "full"])
 def test_those_used_last_are_held_and_the_others_wait_on_disk(
-    writable: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    disk: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path if writable else tmp_path / "missing"))
+    """Without a disk it takes time, and no more."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing" if disk == "missing" else tmp_path))
+    if disk == "full":
+        monkeypatch.setattr(ImageOnDisk, "write", Mock(side_effect=OSError(ENOSPC, "No space left on device")))
+    writable = disk == "writable"
     decoded_images = DecodedImageCache()
     cache = decoded_images.cache(limit=2 * 20_000)
     for index in (0, 1, 0, 1, 2, 1, 0):
@@ -81,18 +86,6 @@ def test_what_waits_on_disk_comes_back_as_it_was(kind: str) -> None:
             for got, true in ((kept.pixels, whole[index].pixels), (kept.opacity, whole[index].opacity)):
                 assert got is not None
                 np.testing.assert_array_equal(got, true)
-
-
-def test_a_full_disk_costs_time_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(ImageOnDisk, "write", full)
-    decoded_images = DecodedImageCache()
-    cache = decoded_images.cache(limit=20_000)
-    for index in (0, 1, 0):
-        np.testing.assert_array_equal(cache.get(index).pixels, decoded_images.frames[index])
-    assert decoded_images.reads == {0: 2, 1: 1}
 
 
 def test_what_is_not_expected_makes_room_and_is_read_once_more_if_need_be() -> None:

@@ -11,8 +11,8 @@ from examples.worlds.turns import TurningSequence, camera_rotations, turning_seq
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
 from rdstitch.compositing.canvas import plan_canvas
+from rdstitch.compositing.compositor import photo_sphere_xmp
 from rdstitch.compositing.panorama_canvas import center_of_view, choose_projection, field_of_view, seen_directions
-from rdstitch.compositing.photo_sphere import photo_sphere_xmp
 from rdstitch.compositing.projection import PLANE, PROJECTIONS
 from rdstitch.compositing.visible_region import VisibleRegion, visible_regions
 from rdstitch.compositing.warp import plan_warp

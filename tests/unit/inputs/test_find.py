@@ -35,12 +35,14 @@ def test_what_is_no_image_in_a_folder_is_named_once(tmp_path: Path) -> None:
     images(tmp_path / "set", 2)
     (tmp_path / "set" / "notes.txt").write_text("x")
     (tmp_path / "set" / ".hidden").write_text("x")
+    (tmp_path / "set" / "1.CR2").write_bytes(b"the same image")
     video(tmp_path / "set" / "clip.avi")
     found = find_images([tmp_path / "set"])
     assert [frame.path.name for frame in found.frames] == ["0.png", "1.png"]
-    (message,) = found.messages
-    assert message.severity == "detail"
-    assert message.text.endswith("not taken for images: clip.avi, notes.txt")
+    assert {message.severity for message in found.messages} == {"detail"}
+    versions, others = (message.text for message in found.messages)
+    assert versions.endswith("are raw or HEIC versions of images that are taken: 1.CR2")
+    assert others.endswith("not taken for images: clip.avi, notes.txt")
 
 
 def test_the_folders_or_the_video_in_a_folder_without_images_are_named(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from PIL.PngImagePlugin import PngInfo
 from rdstitch.errors import InputError
 from rdstitch.inputs.find import find_images
 from rdstitch.io import read as reading
-from rdstitch.io import read_image, read_jpeg, read_metadata, write_image
+from rdstitch.io import read_image, read_metadata, write_image
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.io.metadata import MAX_PROFILE
 from rdstitch.io.opening import MAX_IMAGE_GB
@@ -192,17 +192,6 @@ def test_damaged_files_are_named(tmp_path: Path, name: str) -> None:
             read(tmp_path / name)
 
 
-def test_of_an_image_in_two_formats_the_usual_one_is_taken(tmp_path: Path) -> None:
-    _smooth().save(tmp_path / "a.jpg")
-    (tmp_path / "A.CR2").write_bytes(b"the same")
-    (tmp_path / "notes.txt").touch()
-    found = find_images([tmp_path])
-    assert [frame.path.name for frame in found.frames] == ["a.jpg"]
-    versions, others = (message.text for message in found.messages)
-    assert versions.endswith("are raw or HEIC versions of images that are taken: A.CR2")
-    assert others.endswith("not taken for images: notes.txt")
-
-
 @pytest.mark.parametrize(("name", "shape"), [("a.png", (100, 100, 4)), ("a.tif", (60, 100, 200))])
 def test_the_limit_of_memory_knows_channels_and_depth(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, shape: tuple[int, int, int]
@@ -298,7 +287,6 @@ def test_the_rest_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n
         taken.append(most)
         return read_beginning(path, most)
 
-    for module in (reading, read_jpeg):
-        monkeypatch.setattr(module, "read_beginning", counted)
+    monkeypatch.setattr(reading, "read_beginning", counted)
     np.testing.assert_allclose(read_image(file).pixels, samples, atol=1)
     assert max(taken) < 2**27

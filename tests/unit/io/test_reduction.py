@@ -11,7 +11,7 @@ from PIL import Image
 
 from rdstitch.features import FeatureOptions, View, detect, detect_view
 from rdstitch.io import Metadata, read_image, write_image
-from rdstitch.io.read_jpeg import decoded_jpeg
+from rdstitch.io.read import decoded_jpeg
 from rdstitch.io.reduction import block_mean, halved, reduced_size
 from rdstitch.options.feature_options import CLOSER
 from rdstitch.synthetic import ground

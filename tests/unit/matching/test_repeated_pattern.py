@@ -9,6 +9,7 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import rdstitch
 from examples.worlds.correspondences import stored
@@ -16,6 +17,7 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features import Correspondences, FeatureOptions, Features, detect, match
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
+from rdstitch.matching.copies import near_copies_of
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.pair_estimator import FeatureMatching, PairEstimator
 from rdstitch.matching.repeated_pattern import _MIN_REPETITION, match_pattern, match_repeated_patterns, repetition
@@ -281,15 +283,22 @@ def test_calibrate_matches_boards_so_and_mosaics_do_not(board: Sequence) -> None
 OPTIONS = rdstitch.StitchOptions(workers=1, features=rdstitch.FeatureOptions(max_features=500))
 
 
-@pytest.mark.parametrize("place", [0, 1, 3])
-def test_a_copy_changes_nothing_and_lies_where_its_image_does(place: int) -> None:
+def _seen_in_threes() -> list[NDArray[np.uint8]]:
     lens = Camera((320, 240), distortion=-0.15, focal=300.0)
     poses = grid_poses(lens, 3, 1, overlap=0.5, yaw=0.2, seed=3)
-    taken = sequence_over(lambda size: ground(size, seed=3), lens, poses, photometry=Photometry(noise=0.01), seed=3)
-    frames = taken.frames()
-    saved_again = np.clip(frames[1].astype(int) + np.random.default_rng(0).integers(-1, 2, frames[1].shape), 0, 255)
+    return sequence_over(partial(ground, seed=3), lens, poses, photometry=Photometry(noise=0.01), seed=3).frames()
+
+
+def _saved_again(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    noisy = frame.astype(int) + np.random.default_rng(0).integers(-1, 2, frame.shape)
+    return np.clip(noisy, 0, 255).astype(frame.dtype)
+
+
+@pytest.mark.parametrize("place", [0, 1, 3])
+def test_a_copy_changes_nothing_and_lies_where_its_image_does(place: int) -> None:
+    frames = _seen_in_threes()
     with_copy = [*frames]
-    with_copy.insert(place, saved_again.astype(frames[1].dtype))
+    with_copy.insert(place, _saved_again(frames[1]))
     alone, found = (rdstitch.mosaic(images, None, OPTIONS).registration for images in (frames, with_copy))
     assert found.alignment.used.all()
     original = 2 if place <= 1 else 1
@@ -297,3 +306,25 @@ def test_a_copy_changes_nothing_and_lies_where_its_image_does(place: int) -> Non
     assert found.alignment.distortion_std == pytest.approx(alone.alignment.distortion_std, rel=0.1)
     assert abs(found.alignment.distortion - alone.alignment.distortion) < 0.3 * alone.alignment.distortion_std
     assert [message.code for message in found.alignment.messages].count("copies") == 1
+
+
+def test_a_near_copy_changes_nothing_and_lies_where_it_was_taken() -> None:
+    wide = _seen_in_threes()
+    frames = [frame[:, :316] for frame in wide]
+    images = [*frames, _saved_again(wide[1][:, 4:])]
+    alone, found = (rdstitch.mosaic(some, None, OPTIONS).registration.alignment for some in (frames, images))
+    assert (found.distortion, found.distortion_std) == (alone.distortion, alone.distortion_std)
+    np.testing.assert_allclose(found.homographies[:3], alone.homographies, atol=1e-6)
+    points = np.array([[40.0, 30.0], [160.0, 120.0], [280.0, 200.0]])
+    # Its lens has the centre 4 pixels off the middle.
+    np.testing.assert_allclose(found.transfer(1, 3, points), points - np.array([4.0, 0.0]), atol=0.6)
+
+
+def test_what_only_a_near_copy_reaches_is_no_less_joined() -> None:
+    def shifted(image1: int, image2: int, pixels: float) -> PairRegistration:
+        relation = RadialHomography(np.eye(3), CAMERA, CAMERA, np.ones(300, dtype=np.bool_))
+        return PairRegistration(image1, image2, stored(POINTS, POINTS + np.array([pixels, 0.0])), relation)
+
+    pairs = {(i, j): shifted(i, j, 3.0) for i, j in ((0, 1), (0, 2), (1, 2))}
+    assert near_copies_of(pairs) == {1: 0, 2: 0}
+    assert near_copies_of({**pairs, (1, 3): shifted(1, 3, 90.0)}) == {2: 0}

@@ -1,12 +1,16 @@
-"""What EXIF says of a camera and of when and where it was, as numbers; nonsense is taken for nothing."""
+"""What EXIF says of a camera and of when and where it was, and blocks of it without what is not true any more.
+
+Nonsense is taken for nothing.
+"""
 
 import math
-from collections.abc import Mapping
+import struct
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import datetime
 from typing import Any
 
-from PIL import ExifTags
+from PIL import ExifTags, Image
 
 from rdstitch.geometry.camera import is_focal_length
 from rdstitch.geometry.places import GpsPosition
@@ -19,6 +23,13 @@ _EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Ba
 # How far, as a logarithm, twice the distance of a calibrated middle from the border may be from the width; and how many
 # times as long one tag's focal length may be as another's: crops for video, and what "35 mm equivalent" is taken for.
 _BESIDE, _CONTRADICTION = 0.05, 1.25
+_MAKER_NOTE = 0x927C
+_UNWRITABLE = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, struct.error)
+_TIMES = {int(getattr(ExifTags.Base, name)) for name in ("DateTimeOriginal", "OffsetTimeOriginal")}
+_AUTHOR_TAGS = {
+    int(getattr(ExifTags.Base, name))
+    for name in ("Make", "Model", "Artist", "Copyright", "DateTime", "Software", "ImageDescription", "Orientation")
+}
 
 
 def tag_text(value: Any) -> str:
@@ -104,3 +115,59 @@ def _degrees(value: Any, negative: bool) -> float | None:
         return None
     degrees = sum((part or 0.0) / 60.0**k for k, part in enumerate(parts))
     return -degrees if negative else degrees
+
+
+def upright_exif(exif: Image.Exif, width: int) -> bytes:
+    """EXIF for the output: what orientation, size and maker note said is no longer true of it.
+
+    The resolution of the focal plane counts pixels of the size that EXIF says; ``width`` is that of the image.
+    """
+    if not len(exif):
+        return b""
+
+    def clean(kept: Image.Exif) -> None:
+        photo = kept.get_ifd(ExifTags.IFD.Exif)
+        original = finite(photo.get(PIXEL_WIDTH))
+        for tag in (ExifTags.Base.FocalPlaneXResolution, ExifTags.Base.FocalPlaneYResolution):
+            if original and (resolution := finite(photo.get(tag))) and original != width:
+                photo[tag] = resolution * width / original
+        for gone in (PIXEL_WIDTH, PIXEL_HEIGHT, _MAKER_NOTE):
+            photo.pop(gone, None)
+
+    # First, since what is not of the type that belongs to it cannot be written.
+    exif[ORIENTATION] = 1
+    try:
+        data = exif.tobytes()
+    except _UNWRITABLE:
+        return b""
+    return _edited(data, clean)
+
+
+def without_film_size(data: bytes) -> bytes:
+    """EXIF of an image that was cut or extended: of what film it would be that of is not true."""
+    film = ExifTags.Base.FocalLengthIn35mmFilm
+    return _edited(data, lambda exif: exif.get_ifd(ExifTags.IFD.Exif).pop(film, None))
+
+
+def author_and_time(data: bytes) -> bytes:
+    """EXIF of an image made from several: no lens, exposure or place of one of them is true of it."""
+    return _edited(data, _keep_author_and_time)
+
+
+def _edited(data: bytes, edit: Callable[[Image.Exif], object]) -> bytes:
+    """An EXIF block after a change; empty where it cannot be written, or says nothing."""
+    exif = Image.Exif()
+    try:
+        exif.load(data)
+        edit(exif)
+        return exif.tobytes() if len(exif) else b""
+    except _UNWRITABLE:
+        return b""
+
+
+def _keep_author_and_time(exif: Image.Exif) -> None:
+    photo = exif.get_ifd(ExifTags.IFD.Exif)
+    for tag in set(photo) - _TIMES:
+        del photo[tag]
+    for tag in set(exif) - _AUTHOR_TAGS - {int(ExifTags.IFD.Exif)}:
+        del exif[tag]
