@@ -62,19 +62,6 @@ def _by_image(images: IntArray) -> Iterator[tuple[int, int, IntArray]]:
             yield side, int(of_side[cells[0]]), cells
 
 
-class _Layers(NamedTuple):
-    """What is averaged over the cells of an overlap: of its pixels (h, w, K), then of the cells (M, K)."""
-
-    samples: NDArray[Any]  # K = 2 C: of the first image, then of the second
-    clipped: NDArray[Any]  # K = 4: in any channel of either image, then in all channels of either
-    moments: NDArray[Any]  # K = 5: p, q, p², q² and p q of the grey values p and q
-
-    @classmethod
-    def split(cls, stacked: FloatArray) -> Self:
-        """The layers of what was stacked along the last axis."""
-        return cls(*np.split(stacked, [-9, -5], axis=-1))
-
-
 class _Shown(NamedTuple):
     """What is compared of an image."""
 
@@ -102,11 +89,11 @@ def compare_overlaps(survey: Survey) -> Cells | None:
     if not any(len(of_pair) for of_pair, _, _ in found):
         return None
     pair, middles, means = (np.concatenate(each) for each in zip(*found, strict=True))
-    layers = _Layers.split(means)
+    samples, clipped_share, moments = np.split(means, [-9, -5], axis=1)
     full = full_scale(next(iter(shown.values())).tile.pixels.dtype)
-    values = np.moveaxis(layers.samples.reshape(len(means), 2, -1), 1, 0) / full
-    images, clipped, points = pairs[pair].T, layers.clipped.T > 0.5, np.empty((2, len(pair), 2))
-    evidence = _evidence(layers.moments.T, np.asarray(clipped.any(axis=0)))
+    values = np.moveaxis(samples.reshape(len(means), 2, -1), 1, 0) / full
+    images, clipped, points = pairs[pair].T, clipped_share.T > 0.5, np.empty((2, len(pair), 2))
+    evidence = _evidence(moments.T, np.asarray(clipped.any(axis=0)))
     for side, image, chosen in _by_image(images):
         points[side, chosen] = survey.warps[image].source_points(*middles[chosen].T)
     known = np.isfinite(points).all(axis=(0, 2))
@@ -116,7 +103,11 @@ def compare_overlaps(survey: Survey) -> Cells | None:
 
 
 def _cells_of_overlap(a: _Shown, b: _Shown, box: Box) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Middles (M, 2), pixels of the survey, and means (M, K) of what no image clips, and then of what any clips."""
+    """Middles (M, 2), pixels of the survey, and means (M, K) of what no image clips, and then of what any clips.
+
+    The means are of the samples of both images; of where any, and where all, of their channels are clipped, (M, 4); and
+    of p, q, p², q² and p q of their grey values.
+    """
     side = max(2, round(max(*a.tile.inside.shape, *b.tile.inside.shape) / _CELLS))
     step = max(1, side // _SAMPLES)
     compared: list[tuple[NDArray[Any], NDArray[Any]]] = [

@@ -107,6 +107,10 @@ class PackedFeatures:
         bare = replace(features, descriptors=np.zeros((len(features), 0), dtype=features.descriptors.dtype))
         return cls(bare, _smallest(features.descriptors), features.binary)
 
+    def take(self, index: NDArray[np.intp]) -> Self:
+        """Those of the given indices, in their order."""
+        return replace(self, features=self.features.take(index), descriptors=self.descriptors[index])
+
     def unpack(self) -> Features:
         """The features, with descriptors that can be compared."""
         descriptors: Descriptors = self.descriptors if self.bits else self.descriptors.astype(np.float32)

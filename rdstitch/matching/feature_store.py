@@ -46,10 +46,11 @@ class StoredFeatures:
 
     def load(self) -> Features:
         """Read the features; InputError when they have vanished."""
-        features = self.stored.load().unpack()
-        if self.image_size is not None and features.image_size not in (None, self.image_size):
-            features = _at_size(features, self.image_size)
-        return features if self.chosen is None else features.take(self.chosen)
+        packed = self.stored.load()
+        features = (packed if self.chosen is None else packed.take(self.chosen)).unpack()
+        if self.image_size is None or features.image_size in (None, self.image_size):
+            return features
+        return _at_size(features, self.image_size)
 
     def take(self, index: NDArray[np.intp]) -> Self:
         """Those of the given indices."""

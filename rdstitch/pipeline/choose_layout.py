@@ -4,10 +4,7 @@ Where those of the most probable layout are seen to break, or it stretches what 
 hypotheses that join the same images are laid out at the size that seams are found at, and the one of which a person
 sees the least is taken: without local alignment, by another surface of the scene, a turn of the camera, a plane, free
 homographies, and, where something fills a good part of the images and moves of its own, what lies behind it.
-
-:func:`choose_layout` has each hypothesis laid out (:func:`rdstitch.pipeline.lay_out.lay_out`), which plans its canvas
-(:meth:`rdstitch.pipeline.compose.CanvasPlan.of`) and then decides its exposure and seams
-(:meth:`~rdstitch.pipeline.compose.CanvasPlan.decided`); what it chooses is composed without deciding again.
+What is chosen is composed without deciding exposure and seams again.
 """
 
 import math

@@ -114,11 +114,8 @@ class Tracker:
         self._detection = _live_features(self._options.features)
         self._megapixels = self._detection.limits[1]
         given = self._options.odometry
-        for file in (
-            self._options.attitude,
-            self._options.mask,
-            None if isinstance(given, Odometry) else given,
-        ):  # before the first frame, not at each
+        tables = (self._options.attitude, self._options.mask, None if isinstance(given, Odometry) else given)
+        for file in tables:  # before the first frame, not at each
             if file is not None and file != XMP and not Path(file).is_dir():
                 check_readable(Path(file))
         # Of frames that have been made ready.

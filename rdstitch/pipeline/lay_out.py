@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -40,7 +41,7 @@ class CandidateLayout:
         """What its seams are like."""
         return self.plan.seams
 
-    @property
+    @cached_property
     def faults(self) -> int:
         """What speaks against it: broken seams, stretched places, overlaps that do not look alike, and local alignment
         whose seams lie nowhere where they could be judged, 0 to 4.

@@ -100,23 +100,20 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
         rotate = place.clockwise_deg
     if options.gsd is not None:
         scale *= place.gsd / options.gsd
-    laid = (
-        canvas
-        if (rotate, scale) == (options.rotate, options.scale)
-        else plan(placed, replace(options, rotate=rotate, scale=scale, gsd=None))
-    )
+    laid = canvas
+    if (rotate, scale) != (options.rotate, options.scale):
+        laid = plan(placed, replace(options, rotate=rotate, scale=scale, gsd=None))
     return laid, place_on_canvas(place, canvas, laid), reason
 
 
 def _grid(options: CompositeOptions, place: Georeference) -> MapGrid | None:
     """The grid that the options request."""
-    if options.like is None and options.extent is None:
+    if options.like is not None:
+        grid = read_grid(options.like)
+        return grid if options.extent is None else grid.within(options.extent)
+    if options.extent is None:
         return None
-    if options.like is None:
-        assert options.extent is not None
-        return grid_of_extent(place.crs, options.extent, (options.gsd or place.gsd) * place.map_scale)
-    grid = read_grid(options.like)
-    return grid if options.extent is None else grid.within(options.extent)
+    return grid_of_extent(place.crs, options.extent, (options.gsd or place.gsd) * place.map_scale)
 
 
 def _overlaps(outline: FloatArray, size: tuple[int, int]) -> bool:

@@ -176,9 +176,8 @@ def _of_one_kind(sources: list[Source], strict: bool) -> tuple[list[Source], lis
     left = []
     for source, kind in zip(sources, kinds, strict=True):
         if kind != usual:
-            text = "has {} of {} bits, but most tiles {} of {}".format(
-                *(part for count, bits in (kind, usual) for part in (_channels(count), bits))
-            )
+            each = (f"{_channels(count)} of {bits}" for count, bits in (kind, usual))
+            text = "has {} bits, but most tiles {}".format(*each)
             if strict:
                 raise InputError(f"{source.path}: {text}")
             left.append(left_out(source.path, text))

@@ -116,12 +116,8 @@ def _pair(registration: Registration, title: str, fit: LinkFit) -> str:
             if image is None
             else element("image", href=image, opacity=_FADED, **place)
         )
-    ends = [
-        (points + 0.5) * scale + (left, 0.0)
-        for points, scale, left in zip(
-            (pair.correspondences.points1, pair.correspondences.points2), scales, lefts, strict=True
-        )
-    ]
+    matched_points = pair.correspondences.points1, pair.correspondences.points2
+    ends = [(p + 0.5) * scale + (left, 0.0) for p, scale, left in zip(matched_points, scales, lefts, strict=True)]
     inliers = pair.relation.inliers
     parts += _match_lines(ends[0][~inliers], ends[1][~inliers], RED, 0.25)
     parts += _match_lines(ends[0][inliers], ends[1][inliers], GREEN, 0.6)

@@ -124,7 +124,8 @@ class PlacedImages:
                 partial(_read_moving, reader, self.static) if camera.image_size == common else reader
                 for reader, camera in zip(read, self.cameras, strict=True)
             ]
-        located = self.place is not None
+        located, displacements = self.place is not None, self.displacements or [None] * len(self.sources)
+        images = zip(read, self.cameras, self.homographies, self.sources, displacements, strict=True)
         return [
             PlacedImage(
                 reader,
@@ -138,14 +139,7 @@ class PlacedImages:
                 source.metadata.channels in (3, 4),
                 source.may_be_transparent or self.static is not None,
             )
-            for reader, camera, matrix, source, displacement in zip(
-                read,
-                self.cameras,
-                self.homographies,
-                self.sources,
-                self.displacements or [None] * len(self.sources),
-                strict=True,
-            )
+            for reader, camera, matrix, source, displacement in images
         ]
 
 
