@@ -9,7 +9,7 @@ surroundings: gravel and leaves hide it.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,7 +20,8 @@ from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.system.late_imports import csgraph, sparse, spatial
 
 DIAGONAL = 1000.0  # pixels of an image's diagonal at which seams are looked at: about what a screen shows of it
-_HALF, _REACH, _STEP = 12, 16, 8  # half a window, how far it is searched for, and how far windows are apart
+_HALF, _STEP = 12, 8  # half a window, and how far windows are apart
+_REACHES = 8, 16  # how far a window is searched for, the shorter where the image ends
 _BORDER = 2  # pixels on either side of a seam at which a difference shows
 # Of the range of grey levels: standard deviation in a window that has texture, and of a difference that is seen.
 CONTRAST = 6.0 / 255.0
@@ -118,17 +119,17 @@ def measure_seams(
     pixels of the tiles long; ``unit`` is pixels of the output for one of the tiles, ``full`` the grey level of white.
     """
     pairs, at = _border_places(labels, label_size)
-    clearances: dict[int, _Clearance] = {}
+    searchable: dict[int, list[BoolArray]] = {}
     found: list[tuple[IntArray, FloatArray, _Verdict]] = []
     for pair in np.unique(pairs, axis=0):
         first, second = (tiles[k] for k in pair)
         if first is None or second is None:
             continue
         for k, tile in zip(pair.tolist(), (first, second), strict=True):
-            if k not in clearances:
-                clearances[k] = _Clearance.of(tile.inside)
-        clear1, clear2 = (clearances[k] for k in pair.tolist())
-        here, reaches = _comparable_places((first, clear1), (second, clear2), at[(pairs == pair).all(axis=1)])
+            if k not in searchable:
+                searchable[k] = _searchable(tile.inside)
+        areas1, areas2 = (searchable[k] for k in pair.tolist())
+        here, reaches = _comparable_places((first, areas1), (second, areas2), at[(pairs == pair).all(axis=1)])
         near_border = _on_border(labels, label_size, pair)
         verdicts = _verdicts(first, second, np.rint(here).astype(np.intp), reaches, near_border, CONTRAST * full)
         found += [(pair, place, verdict) for place, verdict in zip(here, verdicts, strict=True) if verdict is not None]
@@ -157,21 +158,11 @@ def _border_places(labels: NDArray[np.int32], label_size: float) -> tuple[IntArr
     return every[middle, :2].astype(np.intp), every[middle, 2:]
 
 
-def _eroded(inside: BoolArray, radius: int) -> BoolArray:
-    """Where a window of this radius lies inside."""
-    kernel = np.ones((2 * radius + 1,) * 2, np.uint8)
-    return cv2.erode(inside.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)) > 0
-
-
-class _Clearance(NamedTuple):
-    """Where windows can be searched for in a tile (h, w)."""
-
-    far: BoolArray  # as far as _REACH
-    near: BoolArray  # half as far
-
-    @classmethod
-    def of(cls, inside: BoolArray) -> Self:
-        return cls(_eroded(inside, _HALF + _REACH), _eroded(inside, _HALF + _REACH // 2))
+def _searchable(inside: BoolArray) -> list[BoolArray]:
+    """Where windows can be searched for in an image (h, w), by each reach."""
+    kernels = [np.ones((2 * (_HALF + reach) + 1,) * 2, np.uint8) for reach in _REACHES]
+    opaque = inside.astype(np.uint8)
+    return [cv2.erode(opaque, k, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)) > 0 for k in kernels]
 
 
 class _Verdict(NamedTuple):
@@ -182,12 +173,12 @@ class _Verdict(NamedTuple):
 
 
 def _comparable_places(
-    first: tuple[SeamTile, _Clearance], second: tuple[SeamTile, _Clearance], at: FloatArray
+    first: tuple[SeamTile, list[BoolArray]], second: tuple[SeamTile, list[BoolArray]], at: FloatArray
 ) -> tuple[FloatArray, IntArray]:
     """Those of the places (N, 2) of one border where windows fit into both tiles, and how far they can be searched."""
     whole, reaches = np.rint(at).astype(np.intp), np.zeros(len(at), dtype=np.intp)
-    (tile1, clear1), (tile2, clear2) = first, second
-    for mask1, mask2, reach in ((clear1.near, clear2.near, _REACH // 2), (clear1.far, clear2.far, _REACH)):
+    (tile1, areas1), (tile2, areas2) = first, second
+    for mask1, mask2, reach in zip(areas1, areas2, _REACHES, strict=True):
         reaches[_looked_up(mask1, tile1.box, whole) & _looked_up(mask2, tile2.box, whole)] = reach
     return at[reaches > 0], reaches[reaches > 0]
 

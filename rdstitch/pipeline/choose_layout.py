@@ -87,14 +87,12 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
     """
     edges_of = cache(lambda image: straight_edges(registration.sources[image]))
     trials = _Trials(options, aligner.options.purpose is Purpose.PANO, edges_of)
+    if options.dry_run:
+        return trials.lay_out(registration)
     first: CandidateLayout | LimitError
     try:
         first = trials.lay_out(registration)
-        if options.dry_run:
-            return first
     except LimitError as error:
-        if options.dry_run:
-            raise
         first = error
     if isinstance(first, LimitError) or first.seams.contradicted:
         registration, first = _plane_behind(registration, first, trials, aligner)

@@ -1,6 +1,7 @@
 """Whether keyframes agree with what is given of the camera: focal length, tilt, and the times of attitudes."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rdstitch.alignment.given_checks import LATE, judged_focal
@@ -23,7 +24,7 @@ class CameraRevision:
 
     length_factor: float | None = None  # by which lengths change as all keyframes are placed again; None: none are
     report_again: bool = False  # whether earlier frames are reported again, as their lengths are far surer
-    messages: tuple[Message, ...] = ()
+    messages: Sequence[Message] = ()
 
 
 def revise_camera(keyframe_map: KeyframeMap, latest: Frame) -> CameraRevision:
@@ -49,20 +50,20 @@ def revise_camera(keyframe_map: KeyframeMap, latest: Frame) -> CameraRevision:
             messages.append(focal_contradicted(knowledge.focal * scale, focal * scale, estimate.log_focal_std))
         knowledge.focal, knowledge.length_std, knowledge.focal_contradicted = focal, estimate.log_focal_std, True
         knowledge.plane = MetricPlane(focal, estimate.tilt_by_itself, True, estimate.tilt_std)
-        return CameraRevision(math.exp(-estimate.log_focal), messages=tuple(messages))
+        return CameraRevision(math.exp(-estimate.log_focal), messages=messages)
     if has_plane:
         if knowledge.focal_contradicted:
-            return CameraRevision(messages=tuple(messages))
+            return CameraRevision(messages=messages)
         if abs(knowledge.delay - delay) > knowledge.delay_std:
-            return CameraRevision(1.0, messages=tuple(messages))
+            return CameraRevision(1.0, messages=messages)
         surer = knowledge.length_std < _SURER * knowledge.given_length_std
         if surer:
             knowledge.given_length_std = knowledge.length_std
-        return CameraRevision(report_again=surer, messages=tuple(messages))
+        return CameraRevision(report_again=surer, messages=messages)
     shown = max(estimate.tilt_std, estimate.rms) * knowledge.focal * latest.camera.scale < MATCH_ERROR
     if shown:
         knowledge.plane = MetricPlane(knowledge.focal, estimate.tilt, True, estimate.tilt_std)
-    return CameraRevision(1.0 if shown else None, messages=tuple(messages))
+    return CameraRevision(1.0 if shown else None, messages=messages)
 
 
 def _estimate(keyframe_map: KeyframeMap, focal: float) -> CameraEstimate:
