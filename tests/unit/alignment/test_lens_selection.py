@@ -12,7 +12,7 @@ import pytest
 
 from examples.worlds.alignment_scenes import Scene, aligned, grid_scene
 from examples.worlds.lens_scenes import FISHEYE, SIZE, lens_distance, lens_scene
-from rdstitch.alignment import LENSES, Alignment
+from rdstitch.alignment import LENSES, Alignment, AlignmentOptions
 from rdstitch.alignment.adjustment_problem import LinkProblem
 from rdstitch.alignment.lens import lens_selection
 from rdstitch.alignment.lens.lens_description import describe_lens, radius_std
