@@ -1,13 +1,13 @@
 """From the adjusted parameters to the :class:`Alignment`: frames, poses, uncertainties, and what was left out."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Self
+from functools import cached_property
 
 import numpy as np
 
-from rdstitch.alignment.adjustment_problem import Problem
+from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.alignment_options import GivenImages
 from rdstitch.alignment.frames.level_frame import levelled
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, FreeParameters
@@ -64,43 +64,99 @@ class AdjustedImages:
     covariance: FloatArray | None = None
     lens_covariance: FloatArray | None = None
 
+    @property
+    def fit(self) -> Fit:
+        """The chosen model, adjusted."""
+        return self.choice.fit
 
-def build_alignment(adjustment: AdjustedImages) -> Alignment:
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the P parameters that were estimated of what all images share."""
+        free = zip(LENS_PARAMETERS, self.problem.free_lens, strict=True)
+        return (*self.fit.model.shared_names, *(name for name, estimated in free if estimated))
+
+    @property
+    def covariance_of_parameters(self) -> FloatArray:
+        """(P, P)."""
+        return self.fit.adjusted.covariance if self.covariance is None else self.covariance
+
+    @cached_property
+    def estimated_lens_covariance(self) -> FloatArray:
+        """(5, 5): of the lens by what was estimated, zero for the rest."""
+        free, shared = np.flatnonzero(self.problem.free_lens), len(self.fit.model.shared_names)
+        result = np.zeros((len(LENS_PARAMETERS), len(LENS_PARAMETERS)))
+        result[np.ix_(free, free)] = self.covariance_of_parameters[shared:, shared:]
+        return result
+
+    @cached_property
+    def considered_lens_covariance(self) -> FloatArray:
+        """(5, 5): of all parameters of the lens, with what was not estimated."""
+        if self.lens_covariance is None or not (self.lens.observable and self.problem.free_lens[0]):
+            return self.estimated_lens_covariance
+        return considered_covariance(self.problem, self.fit, self.lens_covariance, over_relief=self.relief.found)
+
+    @cached_property
+    def errors(self) -> FloatArray:
+        """Of all correspondences (M, 2), pixels, whitened: how far points are off, whatever moved them."""
+        observations, adjusted = replace(self.problem.observations, relief=None), self.fit.adjusted
+        return whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
+
+    @cached_property
+    def squared(self) -> FloatArray:
+        """``|r|²`` of these (M,)."""
+        return squared_lengths(self.errors)
+
+    @cached_property
+    def agreeing(self) -> BoolArray:
+        """Correspondences (M,) that agree: no lens or plane is exact enough for those off by less to disagree."""
+        sigma = self.problem.observations.sigma(self.squared)
+        return self.squared < (ALIGNMENT_WIDTH * math.hypot(sigma, MODEL_ERROR)) ** 2
+
+    @cached_property
+    def relief(self) -> ReliefTest:
+        """Whether the scene is the plane that it is taken for."""
+        seen = self.problem.observations
+        return relief_test(coherence(seen, self.errors, seen.inliers(self.squared)), self.fit.model, len(seen))
+
+    def of_all(self, values: FloatArray) -> FloatArray:
+        """Values of the images aligned (N, ...) as those of all images, NaN for the rest."""
+        result = np.full((len(self.given.cameras), *values.shape[1:]), np.nan)
+        result[self.images] = values
+        return result
+
+
+def build_alignment(adjusted: AdjustedImages) -> Alignment:
     """The alignment, in the frame of the reference image.
 
     A draft, which has no covariances, has the deviations of the normal equations.
     """
-    problem, fit, given = adjustment.problem, adjustment.choice.fit, adjustment.given
-    agreement = _Agreement.of(adjustment)
-    uncertainty = _Uncertainty.of(adjustment, over_relief=agreement.relief.found)
-    cameras = _adjusted_cameras(adjustment, uncertainty)
-    reference = int(adjustment.images[problem.reference])
-    used = np.zeros(len(given.cameras), dtype=np.bool_)
-    used[adjustment.images] = True
-    homographies, poses = _in_frame_of_reference(adjustment)
-    has_lever = agreement.relief.found and fit.model.has_metric_poses and adjustment.covariance is not None
+    fit, agreeing = adjusted.fit, adjusted.squared[adjusted.agreeing]
+    cameras = _adjusted_cameras(adjusted)
+    reference = int(adjusted.images[adjusted.problem.reference])
+    homographies, poses = _in_frame_of_reference(adjusted)
+    has_lever = adjusted.relief.found and fit.model.has_metric_poses and adjusted.covariance is not None
     alignment = Alignment(
         cameras=cameras,
         homographies=homographies,
-        used=used,
-        components=_groups(adjustment),
+        used=np.isin(np.arange(len(cameras)), adjusted.images),
+        components=_groups(adjusted),
         reference=reference,
         model=fit.model.name,
-        model_reason=adjustment.choice.reason,
+        model_reason=adjusted.choice.reason,
         poses=poses,
         tilt_spread=fit.tilt_spread or 0.0,
-        lens=adjustment.lens.name,
-        lens_reason=adjustment.lens.reason,
-        parameters=uncertainty.names,
-        covariance=uncertainty.covariance,
-        rms=agreement.rms,
-        links=_link_fits(adjustment, agreement),
-        relief=agreement.relief,
-        leverage=adjustment.leverage,
-        lever_std=lever_std(problem, fit) if has_lever else 0.0,
-        messages=_messages(adjustment, cameras[reference], uncertainty.considered),
+        lens=adjusted.lens.name,
+        lens_reason=adjusted.lens.reason,
+        parameters=adjusted.parameters,
+        covariance=adjusted.covariance_of_parameters,
+        rms=float(np.sqrt(agreeing.mean())) if len(agreeing) else math.nan,
+        links=_link_fits(adjusted),
+        relief=adjusted.relief,
+        leverage=adjusted.leverage,
+        lever_std=lever_std(adjusted.problem, fit) if has_lever else 0.0,
+        messages=_messages(adjusted, cameras[reference]),
     )
-    return _with_near_copies(alignment, adjustment) if given.near_copies else alignment
+    return _with_near_copies(alignment, adjusted) if adjusted.given.near_copies else alignment
 
 
 def _with_near_copies(alignment: Alignment, adjustment: AdjustedImages) -> Alignment:
@@ -138,108 +194,43 @@ def _with_near_copies(alignment: Alignment, adjustment: AdjustedImages) -> Align
     return replace(result, homographies=homographies, poses=poses)
 
 
-@dataclass(frozen=True, eq=False)
-class _Agreement:
-    """How well the matches agree with the adjustment."""
-
-    squared: FloatArray  # (M,): squared errors, px²
-    agreeing: BoolArray  # (M,)
-    relief: ReliefTest
-
-    @classmethod
-    def of(cls, adjustment: AdjustedImages) -> Self:
-        fit = adjustment.choice.fit
-        # What is reported is how far points are off, whatever moved them.
-        observations = replace(adjustment.problem.observations, relief=None)
-        errors = whitened_errors(observations, fit.adjusted.homographies, fit.adjusted.parameters.lens)
-        squared = squared_lengths(errors)
-        # No lens or plane is exact enough for matches that are off by less to disagree.
-        agreeing = squared < (ALIGNMENT_WIDTH * math.hypot(observations.sigma(squared), MODEL_ERROR)) ** 2
-        left = coherence(observations, errors, observations.inliers(squared))
-        return cls(squared, agreeing, relief_test(left, fit.model, len(observations)))
-
-    @property
-    def rms(self) -> float:
-        """Root mean square of the errors that agree, pixels."""
-        return float(np.sqrt(self.squared[self.agreeing].mean())) if self.agreeing.any() else math.nan
-
-
-@dataclass(frozen=True, eq=False)
-class _Uncertainty:
-    """How well the parameters that all images share are known."""
-
-    names: tuple[str, ...]  # of the P parameters that were estimated
-    covariance: FloatArray  # (P, P)
-    lens: FloatArray  # (5, 5): of the lens by what was estimated, zero for the rest
-    considered: FloatArray  # (5, 5): of all parameters of the lens, with what was not estimated
-
-    @classmethod
-    def of(cls, adjustment: AdjustedImages, *, over_relief: bool) -> Self:
-        """Over relief or not."""
-        problem, fit = adjustment.problem, adjustment.choice.fit
-        covariance = fit.adjusted.covariance if adjustment.covariance is None else adjustment.covariance
-        estimated = [name for name, free in zip(LENS_PARAMETERS, problem.free_lens, strict=True) if free]
-        names = (*fit.model.shared_names, *estimated)
-        lens = considered = _lens_covariance(names, covariance)
-        if adjustment.lens_covariance is not None and adjustment.lens.observable and problem.free_lens[0]:
-            considered = considered_covariance(problem, fit, adjustment.lens_covariance, over_relief=over_relief)
-        return cls(names, covariance, lens, considered)
-
-    @property
-    def std(self) -> FloatArray:
-        """Standard deviations (P,)."""
-        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-
-
-def _adjusted_cameras(adjustment: AdjustedImages, uncertainty: _Uncertainty) -> tuple[Camera, ...]:
+def _adjusted_cameras(adjusted: AdjustedImages) -> tuple[Camera, ...]:
     """The camera of each image, with the lens, the focal length and the tilt that were found."""
-    fit, std = adjustment.choice.fit, uncertainty.std
-    model, shared = fit.model, fit.adjusted.parameters.shared
+    model, shared = adjusted.fit.model, adjusted.fit.adjusted.parameters.shared
+    std = np.sqrt(np.maximum(np.diag(adjusted.covariance_of_parameters), 0.0))
     tilt = tilt_std = None
     if model.has_metric_poses:
         physical = model.physical_parameters(shared)[0]
         tilt, tilt_std = ((float(values[0]), float(values[1])) for values in (physical, std))
 
     def adjusted_camera(camera: Camera) -> Camera:
-        result = _with_lens(adjustment, camera, uncertainty)
+        result = _with_lens(adjusted, camera)
         if model.one_camera:
             focal = model.focal(shared) * camera.scale
-            focal_std = float(std[uncertainty.names.index("log_focal")]) * focal
+            focal_std = float(std[adjusted.parameters.index("log_focal")]) * focal
             result = result.with_focal(focal, "estimate", focal_std)
         return replace(result, tilt=tilt, tilt_std=tilt_std)
 
     # Most images are of one camera.
-    adjusted = {camera: adjusted_camera(camera) for camera in dict.fromkeys(adjustment.given.cameras)}
-    return tuple(adjusted[camera] for camera in adjustment.given.cameras)
+    of_each = {camera: adjusted_camera(camera) for camera in dict.fromkeys(adjusted.given.cameras)}
+    return tuple(of_each[camera] for camera in adjusted.given.cameras)
 
 
-def _lens_covariance(names: Sequence[str], covariance: FloatArray) -> FloatArray:
-    """Covariance (5, 5) of :data:`LENS_PARAMETERS`, zero for those that were not estimated."""
-    result = np.zeros((len(LENS_PARAMETERS), len(LENS_PARAMETERS)))
-    free = [index for index, name in enumerate(LENS_PARAMETERS) if name in names]
-    rows = [names.index(LENS_PARAMETERS[index]) for index in free]
-    result[np.ix_(free, free)] = covariance[np.ix_(rows, rows)]
-    return result
-
-
-def _with_lens(adjustment: AdjustedImages, camera: Camera, uncertainty: _Uncertainty) -> Camera:
+def _with_lens(adjusted: AdjustedImages, camera: Camera) -> Camera:
     """The camera of an image with the lens that was found."""
-    lens, covariance = adjustment.choice.fit.adjusted.parameters.lens, uncertainty.lens
-    center = np.asarray(camera.center) + lens[CENTER] * camera.scale
+    lens, covariance = adjusted.fit.adjusted.parameters.lens, adjusted.estimated_lens_covariance
+    x, y = (np.asarray(camera.center) + lens[CENTER] * camera.scale).tolist()
     estimated = bool(covariance.any())
     result = replace(
-        camera,
-        distortion=float(lens[0]),
-        distortion2=float(lens[1]),
-        distortion3=float(lens[2]),
-        center=(float(center[0]), float(center[1])),
+        camera.with_coefficients(*lens[:3].tolist()),
+        center=(x, y),
         lens_covariance=tuple(map(tuple, covariance.tolist())) if estimated else None,
     )
     if estimated and result.sees_beyond_horizon:
         raise ImpossibleCameraError(f"with λ = {result.distortion:.3g} the corners would see behind the camera")
-    lens_free = bool(adjustment.problem.free_lens.any())
-    shown = adjustment.lens.observable and (adjustment.choice.fit.adjusted.converged or not lens_free)
-    std = _nearest_distortion_std(result, uncertainty.considered) if shown else math.inf
+    converged = adjusted.fit.adjusted.converged or not adjusted.problem.free_lens.any()
+    shown = adjusted.lens.observable and converged
+    std = _nearest_distortion_std(result, adjusted.considered_lens_covariance) if shown else math.inf
     return replace(result, distortion_std=std)
 
 
@@ -253,81 +244,71 @@ def _nearest_distortion_std(camera: Camera, covariance: FloatArray) -> float:
     return math.sqrt(max(float(gradient @ covariance @ gradient), 0.0))
 
 
-def _in_frame_of_reference(adjustment: AdjustedImages) -> tuple[FloatArray, PlanarPoses | None]:
+def _in_frame_of_reference(adjusted: AdjustedImages) -> tuple[FloatArray, PlanarPoses | None]:
     """Image-to-plane homographies of all images, and their poses where the model has them.
 
     The adjustment may have held the reference image anywhere; here it comes to the origin, with yaw zero and, as
     the unit of length, height one.
     """
-    fit, reference = adjustment.choice.fit, adjustment.problem.reference
-    parameters = fit.adjusted.parameters
-    matrices = fit.adjusted.matrices.matrices
-
-    def of_all(values: FloatArray) -> FloatArray:
-        """Of all images, NaN for those that are not aligned."""
-        result = np.full((len(adjustment.given.cameras), *values.shape[1:]), np.nan)
-        result[adjustment.images] = values
-        return result
-
-    if fit.model.on_sphere:
-        given = adjustment.given.options.gravity
-        gravity = None if given is None else np.asarray(given, dtype=np.float64)[adjustment.images]
+    model, parameters, of_all = adjusted.fit.model, adjusted.fit.adjusted.parameters, adjusted.of_all
+    reference, matrices = adjusted.problem.reference, adjusted.fit.adjusted.matrices.matrices
+    if model.on_sphere:
+        given = adjusted.given.options.gravity
+        gravity = None if given is None else np.asarray(given, dtype=np.float64)[adjusted.images]
         return of_all(levelled(matrices, reference, gravity)), None
-    if not fit.model.has_metric_poses:
+    if not model.has_metric_poses:
         return of_all(matrices[reference] @ inverses(matrices)), None
-    metric = fit.model.metric_poses(parameters.poses, parameters.shared)
+    metric = model.metric_poses(parameters.poses, parameters.shared)
     yaw, position = metric[:, YAW], metric[:, [X, Y]]
     height, tilt = np.exp(metric[:, LOG_HEIGHT]), metric[:, [PSI, THETA]]
     frame = rigid_in_plane(yaw[reference], position[reference], height[reference])
     poses = PlanarPoses(yaw, position, height, tilt).relative_to(reference)
-    wanted = adjustment.given.options.pose_covariance and adjustment.covariance is not None
-    covariances = pose_covariances(adjustment.problem, fit) if wanted else ()
+    wanted = adjusted.given.options.pose_covariance and adjusted.covariance is not None
+    covariances = pose_covariances(adjusted.problem, adjusted.fit) if wanted else ()
     aligned_poses = (poses.yaw, poses.position, poses.height, poses.tilt, *covariances)
     return of_all(frame @ inverses(matrices)), PlanarPoses(*map(of_all, aligned_poses))
 
 
-def _groups(adjustment: AdjustedImages) -> tuple[tuple[int, ...], ...]:
+def _groups(adjusted: AdjustedImages) -> tuple[tuple[int, ...], ...]:
     """Connected groups of images by the links not taken for wrong, the aligned one first."""
-    links = [link for link, kept in zip(adjustment.given.links, adjustment.kept_links, strict=True) if kept]
-    groups = connected_components(len(adjustment.given.cameras), [k.image1 for k in links], [k.image2 for k in links])
-    aligned = set(adjustment.images.tolist())
-    ordered = sorted(groups, key=lambda group: group[0] not in aligned)
-    return tuple(tuple(group) for group in ordered)
+    links = [link for link, kept in zip(adjusted.given.links, adjusted.kept_links, strict=True) if kept]
+    groups = connected_components(len(adjusted.given.cameras), [k.image1 for k in links], [k.image2 for k in links])
+    aligned = set(adjusted.images.tolist())
+    return tuple(map(tuple, sorted(groups, key=lambda group: group[0] not in aligned)))
 
 
-def _link_fits(adjustment: AdjustedImages, agreement: _Agreement) -> tuple[LinkFit, ...]:
+def _link_fits(adjusted: AdjustedImages) -> tuple[LinkFit, ...]:
     """How well each link agrees, in the order of the links given."""
-    squared, agreeing = agreement.squared, agreement.agreeing
-    observations = adjustment.problem.observations
-    medians = observations.medians(np.sqrt(squared))
-    images = adjustment.images
+    observations, images = adjusted.problem.observations, adjusted.images
+    medians = observations.medians(np.sqrt(adjusted.squared))
     rows = {
         frozenset((int(images[i]), int(images[j]))): row
         for row, (i, j) in enumerate(zip(observations.image1, observations.image2, strict=True))
     }
     result = []
-    for link, kept in zip(adjustment.given.links, adjustment.kept_links, strict=True):
+    for link, kept in zip(adjusted.given.links, adjusted.kept_links, strict=True):
         row = rows.get(frozenset((link.image1, link.image2)))
         if row is None or not kept:
             why = Unused.ELSEWHERE if kept else Unused.CONTRADICTS
             result.append(LinkFit(link.image1, link.image2, len(link), 0, math.nan, False, why))
             continue
         rows_of_link = slice(observations.start[row], observations.start[row + 1])
-        good = squared[rows_of_link][agreeing[rows_of_link]]
-        fraction = len(good) / max(len(agreeing[rows_of_link]), 1)
+        agreeing = adjusted.agreeing[rows_of_link]
+        good = adjusted.squared[rows_of_link][agreeing]
+        inliers = round(len(good) / max(len(agreeing), 1) * len(link))
         rms = float(np.sqrt(good.mean())) if len(good) else float(medians[row])
-        result.append(LinkFit(link.image1, link.image2, len(link), round(fraction * len(link)), rms, True))
+        result.append(LinkFit(link.image1, link.image2, len(link), inliers, rms, True))
     return tuple(result)
 
 
-def _messages(adjustment: AdjustedImages, camera: Camera, considered: FloatArray) -> tuple[Message, ...]:
-    """What the user should know of the whole, with the covariance (5, 5) of all parameters of a lens."""
-    result, lens, known = list[Message](), adjustment.lens, adjustment.problem.camera_priors
-    purpose, fit = adjustment.given.options.purpose, adjustment.choice.fit
+def _messages(adjusted: AdjustedImages, camera: Camera) -> tuple[Message, ...]:
+    """What the user should know of the whole."""
+    result, lens, known = list[Message](), adjusted.lens, adjusted.problem.camera_priors
+    purpose, fit = adjusted.given.options.purpose, adjusted.fit
     if lens.depth or not lens.observable:
         result.append(lens_not_observable(purpose, depth=lens.depth))
-    elif (count := len(adjustment.images)) < ENOUGH_IMAGES and adjustment.problem.free_lens.any():
-        every = replace(camera, lens_covariance=tuple(map(tuple, considered.tolist())))
+    elif (count := len(adjusted.images)) < ENOUGH_IMAGES and adjusted.problem.free_lens.any():
+        every = replace(camera, lens_covariance=tuple(map(tuple, adjusted.considered_lens_covariance.tolist())))
         off = _CONFIDENT * float(radius_std(every, _RADII)[-1])
         if off > _WORTH_SAYING:
             result.append(few_images(count, ENOUGH_IMAGES, off, purpose))
@@ -337,6 +318,6 @@ def _messages(adjustment: AdjustedImages, camera: Camera, considered: FloatArray
             result.append(focal_overruled(ratio))
     if not fit.adjusted.converged:
         result.append(not_converged(purpose))
-    if adjustment.positions_disagree:
-        result.append(Message(adjustment.positions_disagree))
-    return (*result, *adjustment.messages)
+    if adjusted.positions_disagree:
+        result.append(Message(adjusted.positions_disagree))
+    return (*result, *adjusted.messages)

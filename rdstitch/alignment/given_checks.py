@@ -61,12 +61,15 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
     fitted = _fit_without_tilts(problem, options, without)
     if fitted is None:
         return None
-    known = problem.camera_priors
+    priors = problem.camera_priors
     shown = _ShownTilts.of(*fitted, free_mount=options.tilt is None)
-    if known.delayed_attitudes is not None and (late := shown.delay(known.delayed_attitudes + known.tilt)) is not None:
+    if (
+        priors.delayed_attitudes is not None
+        and (late := shown.delay(priors.delayed_attitudes + priors.tilt)) is not None
+    ):
         attitudes = at_delay(np.asarray(options.delayed_attitudes), late[0])
         return replace(options, attitudes=attitudes, delayed_attitudes=None), attitudes_late(*late)
-    given, stated = known.attitudes + known.tilt, options.attitudes_std if options.attitudes is not None else 0.0
+    given, stated = priors.attitudes + priors.tilt, options.attitudes_std if options.attitudes is not None else 0.0
     # The largest log likelihood and its scatter of tilts as given, with other signs or order, and of none.
     changed = [shown.best_scatter(given @ change.T) for change in _SIGNED_ORDERS]
     (as_given, scatter), likeliest = changed[0], max(range(len(changed)), key=lambda k: changed[k][0])
@@ -87,9 +90,9 @@ def _fit_without_tilts(
     problem: Problem, options: AlignmentOptions, without: AlignmentOptions
 ) -> tuple[Problem, Fit] | None:
     """The problem that knows nothing of the tilts, and a fit with the tilts that it shows; None where it shows none."""
-    known = problem.camera_priors
+    priors = problem.camera_priors
     nothing = replace(
-        known, attitudes=np.zeros_like(known.attitudes), attitudes_std=None, tilt=(0.0, 0.0), tilt_known=False
+        priors, attitudes=np.zeros_like(priors.attitudes), attitudes_std=None, tilt=(0.0, 0.0), tilt_known=False
     )
     bare = replace(problem, camera_priors=nothing)
     models = [name for name in without.models if not MODELS[name].on_sphere]

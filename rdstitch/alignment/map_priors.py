@@ -86,7 +86,7 @@ class _KnownPlaces(ABC):
         """Where a fit has them, (N,)."""
 
     @abstractmethod
-    def prior(self, known: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
+    def prior(self, priors: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
         """With priors on the places: their means (N, 2) and inverse variances (N,)."""
 
     @abstractmethod
@@ -101,7 +101,7 @@ class _KnownPlaces(ABC):
         middle = complex(np.median(self.metres.real), np.median(self.metres.imag))
         return float(np.median(np.abs(self.metres - middle) / self.std)) >= _MIN_SPREAD
 
-    def prior_from_map(self, known: CameraPriors, fit: Fit) -> tuple[CameraPriors, SimilarityFit, float]:
+    def prior_from_map(self, priors: CameraPriors, fit: Fit) -> tuple[CameraPriors, SimilarityFit, float]:
         """The prior by the places of a fit, the similarity to the map, and by how much errors exceed their std."""
         places = self.estimated(fit)
         similar = fit_similarity(places, self.metres, float(np.median(self.std)))
@@ -111,7 +111,7 @@ class _KnownPlaces(ABC):
         excess = float(np.median(similar.residuals / self.std)) / RAYLEIGH_MEDIAN * math.sqrt(count / (count - 2))
         excess = max(excess, 1.0)
         precision = similar.weights * (abs(scale) / (self.std * excess)) ** 2
-        return self.prior(known, target, precision), similar, excess
+        return self.prior(priors, target, precision), similar, excess
 
 
 class _Positions(_KnownPlaces):
@@ -128,10 +128,10 @@ class _Positions(_KnownPlaces):
         places: ComplexArray = fit.adjusted.parameters.poses[self.known][:, [X, Y]] @ _COMPLEX
         return places
 
-    def prior(self, known: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
+    def prior(self, priors: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
         places, weights = np.zeros((len(self.known), 2)), np.zeros(len(self.known))
         places[self.known], weights[self.known] = target, precision
-        return replace(known, places=places, places_precision=weights)
+        return replace(priors, places=places, places_precision=weights)
 
     def jacobians(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
         image = np.flatnonzero(self.known)
@@ -148,14 +148,14 @@ class _Control(_KnownPlaces):
     def __init__(self, problem: Problem, fit: Fit) -> None:
         given = problem.camera_priors.control
         shown = np.flatnonzero(np.isfinite(_sightings(given, fit)).all(axis=1))
-        self.points = known = given.subset(shown)
-        self.metres = known.places @ np.array([1.0, -1.0j])
-        self.count = np.bincount(known.point, minlength=len(known.names))
-        self.std, self.labels, self.item = known.std, known.names, known.point
+        self.points = control = given.subset(shown)
+        self.metres = control.places @ np.array([1.0, -1.0j])
+        self.count = np.bincount(control.point, minlength=len(control.names))
+        self.std, self.labels, self.item = control.std, control.names, control.point
         if len(self.metres) >= self.min_count:
             places = self.estimated(fit)
-            pixel = np.bincount(known.point, known.pixel) / self.count
-            self.std = np.hypot(known.std, _CLICK * pixel * abs(fit_similarity(places, self.metres, 0.0).scale))
+            pixel = np.bincount(control.point, control.pixel) / self.count
+            self.std = np.hypot(control.std, _CLICK * pixel * abs(fit_similarity(places, self.metres, 0.0).scale))
 
     def estimated(self, fit: Fit) -> ComplexArray:
         sums = np.zeros((len(self.metres), 2))
@@ -163,11 +163,11 @@ class _Control(_KnownPlaces):
         means: ComplexArray = (sums / self.count[:, None]) @ _COMPLEX
         return means
 
-    def prior(self, known: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
+    def prior(self, priors: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
         shown = self.points
         # What a point is off by is the same in all images that show it.
         shared = (precision / self.count)[shown.point]
-        return replace(known, marks=PlaneMarks(shown.image, shown.points, target[shown.point], shared))
+        return replace(priors, marks=PlaneMarks(shown.image, shown.points, target[shown.point], shared))
 
     def jacobians(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
         parameters, marks = fit.adjusted.parameters, adjuster.priors.marks
@@ -177,9 +177,12 @@ class _Control(_KnownPlaces):
         return marks.image, derivative, marks.precision
 
 
-def _sightings(known: ControlPoints, fit: Fit) -> FloatArray:
+def _sightings(control: ControlPoints, fit: Fit) -> FloatArray:
     """Where a fit has each sighting of control points, (M, 2); not finite where no place looks like that."""
-    adjusted, marks = fit.adjusted, PlaneMarks(known.image, known.points, known.points, np.zeros(len(known.image)))
+    adjusted, marks = (
+        fit.adjusted,
+        PlaneMarks(control.image, control.points, control.points, np.zeros(len(control.image))),
+    )
     focal = fit.model.focal(adjusted.parameters.shared)
     return marks.places(adjusted.matrices.matrices, adjusted.parameters.lens, focal)
 

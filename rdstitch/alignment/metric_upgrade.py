@@ -49,18 +49,15 @@ def metric_upgrade(
 
 def _cost(relative: FloatArray, tilts: FloatArray, log_focal: float) -> FloatArray:
     """Mean truncated squared error of the conditions (T,) of the N images for each of T tilts of the reference."""
-    blocks = np.array_split(tilts, math.ceil(len(tilts) * len(relative) / _AT_ONCE))
-    return np.concatenate([_cost_of_block(relative, block, log_focal) for block in blocks if len(block)])
-
-
-def _cost_of_block(relative: FloatArray, tilts: FloatArray, log_focal: float) -> FloatArray:
-    metric = _metric(relative, tilts, log_focal)
-    a, b = metric[..., 0], metric[..., 1]
-    aa, bb, ab = ((p * q).sum(axis=-1) for p, q in ((a, a), (b, b), (a, b)))
-    error = ((aa - bb) ** 2 + (2.0 * ab) ** 2) / np.maximum(aa + bb, 1e-300) ** 2
-    behind = (metric[..., 2] * np.cross(a, b)).sum(axis=-1) <= 0.0
-    cost: FloatArray = np.where(behind, _OUTLYING**2, np.minimum(error, _OUTLYING**2)).mean(axis=1)
-    return cost
+    costs = []
+    for block in np.array_split(tilts, min(math.ceil(len(tilts) * len(relative) / _AT_ONCE), len(tilts))):
+        metric = _metric(relative, block, log_focal)
+        a, b = metric[..., 0], metric[..., 1]
+        aa, bb, ab = ((p * q).sum(axis=-1) for p, q in ((a, a), (b, b), (a, b)))
+        error = ((aa - bb) ** 2 + (2.0 * ab) ** 2) / np.maximum(aa + bb, 1e-300) ** 2
+        behind = (metric[..., 2] * np.cross(a, b)).sum(axis=-1) <= 0.0
+        costs.append(np.where(behind, _OUTLYING**2, np.minimum(error, _OUTLYING**2)).mean(axis=1))
+    return np.concatenate(costs)
 
 
 def _metric(relative: FloatArray, tilts: FloatArray, log_focal: float) -> FloatArray:

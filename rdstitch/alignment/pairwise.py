@@ -77,10 +77,10 @@ def pairwise_homographies(links: LinkProblem) -> BundleAdjustmentResult:
 
 def best_trial(links: LinkProblem, model: MotionModel) -> tuple[BundleAdjuster, Parameters]:
     """Of a few links on their own, from the shared parameters that come nearest to them without adjustment."""
-    known, few = links.camera_priors, evenly_spaced(len(links.observations), _TRIAL_LINKS)
+    priors, few = links.camera_priors, evenly_spaced(len(links.observations), _TRIAL_LINKS)
     sample = links.observations.subset(few).thinned(_TRIAL_MATCHES)
-    trial = LinkProblem(sample, links.homographies[few], links.lens, links.free_lens, known)
-    starts = model.shared_starts(known.log_focal, known.tilt, tilt_known=known.tilt_known)
+    trial = LinkProblem(sample, links.homographies[few], links.lens, links.free_lens, priors)
+    starts = model.shared_starts(priors.log_focal, priors.tilt, tilt_known=priors.tilt_known)
     trials = [independent_pairs(trial, model, shared) for shared in starts]
     squared = [adjuster.squared(start) for adjuster, start in trials]
     width = ALIGNMENT_WIDTH * min(float(np.median(sample.scale2)), *map(sigma_of, squared))
@@ -88,13 +88,9 @@ def best_trial(links: LinkProblem, model: MotionModel) -> tuple[BundleAdjuster, 
     return replace(adjuster, min_gain=LOOSE_GAIN), start
 
 
-def fit_trial(links: LinkProblem, model: MotionModel) -> BundleAdjustmentResult:
-    """A few links on their own under one camera."""
-    adjuster, start = best_trial(links, model)
-    return adjuster.run(start)
-
-
-def fit_pairwise(problem: Problem, model: MotionModel, trial: BundleAdjustmentResult) -> BundleAdjustmentResult:
-    """All links on their own under one camera, which starts as a trial has it."""
-    adjuster, start = independent_pairs(problem, model, trial.parameters.shared)
-    return replace(adjuster, min_gain=problem.min_gain).run(start)
+def fit_pairwise(problem: Problem, model: MotionModel) -> tuple[BundleAdjustmentResult, FloatArray]:
+    """All links on their own under one camera, and the shared parameters where a few of them have put its start."""
+    adjuster, start = best_trial(problem, model)
+    shared = adjuster.run(start).parameters.shared
+    adjuster, start = independent_pairs(problem, model, shared)
+    return replace(adjuster, min_gain=problem.min_gain).run(start), shared

@@ -88,25 +88,25 @@ def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
 def _lens_and_model(given: GivenImages) -> AdjustedImages:
     """The lens, the wrong pairs and the model, by as many matches of each link as show them."""
     options, messages = given.options, list[Message]()
-    known = options.camera_priors(given.cameras)
+    priors = options.camera_priors(given.cameras)
     all_matches, relations = _observations(given.links, given.cameras, _matches_of_a_link(len(given.links), options))
     sample = all_matches.thinned(int(np.clip(_MATCHES_FOR_SELECTION // len(given.links), 40, 150)))
-    lens = choose_observable_lens(given, sample, relations, known)
+    lens = choose_observable_lens(given, sample, relations, priors)
     wrong, confirmed = cycle_consistency(lens.pairwise, sample, len(given.cameras))
-    all_links = _problem_of_all_links(given, sample, lens, _tree_ranks(sample, confirmed), known, wrong)
-    problem, images = all_links.part(~wrong)
+    all_links = _problem_of_all_links(given, sample, lens, _tree_ranks(sample, confirmed), priors, wrong)
+    connected, images = all_links.part(~wrong)
     # Data weigh against priors as they will in the final adjustment.
-    shared, _ = independent_errors(problem.observations, problem.homographies, problem.lens)
-    all_links, problem = (replace(one, overdispersion=shared) for one in (all_links, problem))
-    while (contradiction := check_attitudes(problem, options)) is not None:
+    shared, _ = independent_errors(connected.observations, connected.homographies, connected.lens)
+    all_links, connected = (replace(one, overdispersion=shared) for one in (all_links, connected))
+    while (contradiction := check_attitudes(connected, options)) is not None:
         options, message = contradiction
         messages.append(message)
         all_links = replace(all_links, camera_priors=options.camera_priors(given.cameras))
-        problem, _ = all_links.part(~wrong)
-    choice = select_model(problem, options.models, lens.refinements, options.purpose)
+        connected, _ = all_links.part(~wrong)
+    choice = select_model(connected, options.models, lens.refinements, options.purpose)
     choice, images, wrong = _drop_wrong_pairs(all_links, images, choice, wrong)
-    problem, _ = all_links.part(~wrong, images)
-    choice = choose_over_relief(problem, choice, options.models, options.purpose)
+    aligned, _ = all_links.part(~wrong, images)
+    choice = choose_over_relief(aligned, choice, options.models, options.purpose)
     if options.reference is not None and options.reference not in images:
         messages.append(REFERENCE_LEFT_OUT)
     free = choice.fit.free_lens
@@ -115,7 +115,7 @@ def _lens_and_model(given: GivenImages) -> AdjustedImages:
         images,
         ~wrong,
         replace(all_links, observations=all_matches, free_lens=free, min_gain=MIN_GAIN),
-        replace(problem, free_lens=free),
+        replace(aligned, free_lens=free),
         choice,
         lens.refined(free),
         messages=tuple(messages),
@@ -123,13 +123,18 @@ def _lens_and_model(given: GivenImages) -> AdjustedImages:
 
 
 def _problem_of_all_links(
-    given: GivenImages, sample: Observations, lens: LensChoice, trust: FloatArray, known: CameraPriors, wrong: BoolArray
+    given: GivenImages,
+    sample: Observations,
+    lens: LensChoice,
+    trust: FloatArray,
+    priors: CameraPriors,
+    wrong: BoolArray,
 ) -> Problem:
     """The problem of all images, with the reference that was asked for, or else a good one of those not ``wrong``."""
     homographies, start = lens.pairwise.homographies, lens.pairwise.parameters.lens
     count, reference = len(given.cameras), given.options.reference
     all_links = Problem(
-        sample, homographies, start, lens.free, known, trust=trust, count=count, fixed=reference, min_gain=FEW_GAIN
+        sample, homographies, start, lens.free, priors, trust=trust, count=count, fixed=reference, min_gain=FEW_GAIN
     )
     if reference is None:
         problem, images = all_links.part(~wrong)

@@ -21,7 +21,7 @@ from rdstitch.alignment.least_squares.link_equations import whitened_errors
 from rdstitch.alignment.lens.lens_selection import NO_COHERENCE, residual_coherence
 from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.alignment.noise import evidence_of
-from rdstitch.alignment.pairwise import fit_pairwise, fit_trial
+from rdstitch.alignment.pairwise import fit_pairwise
 from rdstitch.alignment.starts import fit_model
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.choices import Purpose
@@ -158,9 +158,8 @@ class _TurnTrial:
     def of(cls, posterior: Posterior, problem: Problem, model: MotionModel) -> Self:
         if len(problem.observations) == 1:  # a trial is the whole
             return cls(model, -math.inf, None)
-        trial = fit_trial(problem, model)
-        bound = posterior.lower_bound(model, fit_pairwise(problem, model, trial).errors)
-        return cls(model, bound, trial.parameters.shared)
+        pairs, shared = fit_pairwise(problem, model)
+        return cls(model, posterior.lower_bound(model, pairs.errors), shared)
 
     def scored(self, posterior: Posterior) -> Hypothesis:
         return posterior.scored(fit_model(posterior.problem, self.model, shared=self.shared))

@@ -110,11 +110,11 @@ have as many as are looked for at the most."""
 
 
 def explain_unaligned(
-    alignment: Alignment, paths: Sequence[str], keypoints: Sequence[int], known: Mapping[int, str]
+    alignment: Alignment, paths: Sequence[str], keypoints: Sequence[int], reasons: Mapping[int, str]
 ) -> list[Message]:
     """One message for each image that the alignment does not use, by the paths of all and their numbers of features.
 
-    ``known`` are the reasons of those of which it is known beforehand.
+    ``reasons`` are those that are known beforehand, by image.
     """
     contradicting: dict[int, list[int]] = {}
     for fit in alignment.links:
@@ -127,8 +127,8 @@ def explain_unaligned(
     for image, path in enumerate(paths):
         if alignment.used[image]:
             continue
-        if image in known:
-            reason = known[image]
+        if image in reasons:
+            reason = reasons[image]
         elif image in block_of:
             number, size = block_of[image], len(blocks[block_of[image]])
             reason = (

@@ -34,11 +34,6 @@ class PairLenses:
     distortion2: FloatArray | None = None  # μ
     center: FloatArray | None = None
 
-    @property
-    def distortion_of_image2(self) -> FloatArray:
-        """λ of image 2, (B,)."""
-        return self.distortion if self.second_distortion is None else self.second_distortion
-
     def growing(self, distortion: FloatArray, radius2: FloatArray, times: tuple[float, float]) -> FloatArray:
         """``times[0] λ + times[1] μ r²`` at squared radii (B, N), of λ (B,)."""
         first = times[0] * distortion[:, None]
@@ -105,7 +100,7 @@ class _Transfer:
         lost = ~(z[:, 2] > 0.0)
         inverse_depth = 1.0 / np.where(lost, 1.0, z[:, 2])
         u = z[:, :2] * inverse_depth[:, None]
-        second, mu = lens.distortion_of_image2, lens.distortion2
+        mu, second = lens.distortion2, lens.distortion if lens.second_distortion is None else lens.second_distortion
         g = distorted_ratio(u[:, 0] ** 2 + u[:, 1] ** 2, second[:, None], None if mu is None else mu[:, None])
         lost |= np.isnan(g)
         g[lost] = 1.0

@@ -11,7 +11,6 @@ from typing import NamedTuple
 from rdstitch.alignment.result import LinkFit, links_by_image
 from rdstitch.alignment.sentences import few_features
 from rdstitch.choices import Purpose
-from rdstitch.inputs.source import Source
 from rdstitch.results.messages import Severity
 from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Kind
@@ -174,12 +173,12 @@ def _two_left(evidence: ResultEvidence) -> Iterator[Finding]:
 def _inputs(evidence: ResultEvidence) -> Iterator[Finding]:
     """Images of several cameras or zoom settings, and images without a mask among others, by headers and files."""
     sources = evidence.registration.sources
+    headers = [(k, source.metadata) for k, source in enumerate(sources)]
     bodies: dict[str, list[int]] = {}
-    for k, source in enumerate(sources):
-        m = source.metadata
-        if m.model or m.serial:
-            bodies.setdefault(" ".join(filter(None, (m.make, m.model, m.serial))), []).append(k)
-    focal = {k: _focal_share(source) for k, source in enumerate(sources) if source.metadata.focal_px is not None}
+    for k, header in headers:
+        if header.model or header.serial:
+            bodies.setdefault(" ".join(filter(None, (header.make, header.model, header.serial))), []).append(k)
+    focal = {k: header.focal_px / max(header.size) for k, header in headers if header.focal_px is not None}
     if len(bodies) > 1:
         yield Finding(Kind.SEVERAL_CAMERAS, (), "warning", {"bodies": bodies})
     elif focal and max(focal.values()) > Limits.max_focal_ratio * min(focal.values()):
@@ -188,10 +187,6 @@ def _inputs(evidence: ResultEvidence) -> Iterator[Finding]:
     without = [k for k, source in enumerate(sources) if source.mask is None]
     if 0 < len(without) < len(sources):
         yield Finding(Kind.UNMASKED, (), "warning", {"without": without})
-
-
-def _focal_share(source: Source) -> float:
-    return float(source.metadata.focal_px or 0.0) / max(source.metadata.size)
 
 
 class Rule(NamedTuple):

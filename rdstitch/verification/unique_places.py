@@ -86,8 +86,8 @@ def departures(pixels: Grey) -> Grey | None:
 
     Gives (h, w): 0 where it does not; NaN where nothing is known. None for an image that shows too few periods.
     """
-    peaks = _peaks(Overlaps.of(pixels, pixels), pixels, np.zeros(2), _OWN_OVERLAP)
-    periods = peaks.shift[np.hypot(*peaks.shift.T) > _MIN_SHIFT]
+    shifts, _ = _peaks(Overlaps.of(pixels, pixels), pixels, np.zeros(2), _OWN_OVERLAP)
+    periods = shifts[np.hypot(*shifts.T) > _MIN_SHIFT]
     periods = periods[np.argsort(np.hypot(*periods.T), kind="stable")][:_MAX_PERIODS]
     if len(periods) < Limits.min_periods:
         return None
@@ -114,31 +114,26 @@ def unique_shift(first: Drawing, second: Drawing, unique1: Grey, unique2: Grey) 
     None where the pattern of both fits nowhere.
     """
     offset = np.rint(first.origin - second.origin)
-    peaks = _peaks(Overlaps.of(first.pixels, second.pixels), first.pixels, offset, _OVERLAP)
-    if not len(peaks.shift):
+    shifts, places = _peaks(Overlaps.of(first.pixels, second.pixels), first.pixels, offset, _OVERLAP)
+    if not len(shifts):
         return None
     overlaps = Overlaps.of(unique1, unique2)
-    matched, share = np.zeros(len(peaks.shift)), np.zeros(len(peaks.shift))
-    for k, (row, column) in enumerate(peaks.place.tolist()):
+    matched, share = np.zeros(len(shifts)), np.zeros(len(shifts))
+    for k, (row, column) in enumerate(places.tolist()):
         box = slice(row - 1, row + 2), slice(column - 1, column + 2)
         share[k] = overlaps.correlation(box).max(initial=0.0)
         matched[k] = share[k] * overlaps.products[box].max(initial=0.0)
     best = int(matched.argmax())
-    elsewhere = np.hypot(*(peaks.shift - peaks.shift[best]).T) > _MIN_SHIFT
+    elsewhere = np.hypot(*(shifts - shifts[best]).T) > _MIN_SHIFT
     best_elsewhere = float(matched[elsewhere].max(initial=0.0))
-    return UniqueShift(peaks.shift[best], float(matched[best]), float(share[best]), best_elsewhere)
+    return UniqueShift(shifts[best], float(matched[best]), float(share[best]), best_elsewhere)
 
 
-@dataclass(frozen=True, eq=False)
-class _Peaks:
-    """Shifts by which two drawings fit, (N, 2) as (x, y), pixels, and their rows and columns (N, 2) among all."""
+def _peaks(overlaps: Overlaps, first: Grey, offset: FloatArray, least_overlap: float) -> tuple[FloatArray, IntArray]:
+    """Shifts (N, 2) by which two drawings fit, (x, y) from ``offset`` on, to a part of a pixel; their rows and columns.
 
-    shift: FloatArray
-    place: IntArray
-
-
-def _peaks(overlaps: Overlaps, first: Grey, offset: FloatArray, least_overlap: float) -> _Peaks:
-    """The peaks of the correlation, to a part of a pixel, from the shift ``offset`` (x, y) on."""
+    The peaks of the correlation.
+    """
     score = overlaps.correlation()
     kernel = np.ones((2 * _MIN_SHIFT + 1, 2 * _MIN_SHIFT + 1), dtype=np.uint8)
     enough = overlaps.area >= least_overlap * overlaps.area.max()
@@ -151,7 +146,7 @@ def _peaks(overlaps: Overlaps, first: Grey, offset: FloatArray, least_overlap: f
     )
     height, width = first.shape
     shift = np.column_stack([column - (width - 1) - offset[0] + x, row - (height - 1) - offset[1] + y])
-    return _Peaks(shift, np.column_stack([row, column]))
+    return shift, np.column_stack([row, column])
 
 
 def _shifted(pixels: Grey, shift: FloatArray) -> Grey:

@@ -175,12 +175,12 @@ def assemble(
     homographies: FloatArray,
     free: BoolArray,
     weight: float,
-    known: ImageEquations | None = None,
+    marks: ImageEquations | None = None,
 ) -> SparseNormalEquations:
     """Chain the equations of the links with the derivatives of the model, whose shared parameters the lens follows.
 
-    The homographies are those of the links (L, 3, 3), the weight is one over the variance of the errors; what is
-    ``known`` of single images comes besides.
+    The homographies are those of the links (L, 3, 3), the weight is one over the variance of the errors; what
+    ``marks`` in single images show comes besides.
     """
     size, others = model.by_pose.shape[1], model.by_shared.shape[1] + equations.gram.shape[1] - 9
     pair, count = 2 * size, len(free)
@@ -191,8 +191,8 @@ def assemble(
         derivative = link_derivatives(observations, model, homographies, equations.gram.shape[1] - 9, links)
         local = np.swapaxes(derivative, 1, 2) @ equations.gram[links] @ derivative * weight
         gradient = np.einsum("lpk,lp->lk", derivative, equations.gradient[links]) * weight
-        if known is not None:
-            known.add_to(local, gradient, observations, links)
+        if marks is not None:
+            marks.add_to(local, gradient, observations, links)
         images = observations.image1[links], observations.image2[links]
         moving = np.concatenate([free[images[0]], free[images[1]], np.ones((len(local), others))], axis=1)
         local, gradient = local * moving[:, :, None] * moving[:, None, :], gradient * moving

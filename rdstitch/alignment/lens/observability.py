@@ -27,12 +27,12 @@ times of what a fisheye leaves beside λ."""
 
 
 def choose_observable_lens(
-    task: GivenImages, sample: Observations, relations: Sequence[RadialHomography], known: CameraPriors
+    task: GivenImages, sample: Observations, relations: Sequence[RadialHomography], priors: CameraPriors
 ) -> LensChoice:
     """Of every link with a homography of its own: whether λ is seen, or could be depth, and which lens it is."""
 
     def links_at(lens: FloatArray, free: BoolArray) -> LinkProblem:
-        return LinkProblem(sample, relations_at(sample, relations, lens), lens, free, known)
+        return LinkProblem(sample, relations_at(sample, relations, lens), lens, free, priors)
 
     options, first, none = task.options, np.arange(len(LENS_STD)) == 0, np.zeros(len(LENS_STD), dtype=np.bool_)
     # The images' points are already relative to the centre of the camera.

@@ -329,24 +329,23 @@ def test_a_lens_at_the_limit_of_folding_has_a_deviation() -> None:
 
 def test_mistakes_of_the_caller() -> None:
     given = grid_scene(2, 1, seed=15)
-    with pytest.raises(RegistrationError, match="no two images overlap"):
-        align(given.cameras, [])
-    with pytest.raises(ArgumentError, match="same images"):
-        align(given.cameras, [given.links[0], given.links[0]])
-    with pytest.raises(ArgumentError, match="outside of the 1"):
-        align(given.cameras[:1], given.links)
-    lenses = [Camera((640, 480), -0.25), Camera((640, 480))]
-    with pytest.raises(ArgumentError, match="lenses that differ"):
-        align(lenses, given.links, AlignmentOptions(lens_known=True))
-    with pytest.raises(ArgumentError, match="model must be"):
-        AlignmentOptions(model="affine")
-    with pytest.raises(ArgumentError, match="with itself"):
-        replace(given.links[0], image2=0)
-    with pytest.raises(ArgumentError, match="not finite"):
-        replace(given.links[0], points1=given.links[0].points1 * np.nan)
+    cameras, (link,) = given.cameras, given.links
     failed = RadialHomography.failed("none", Camera((4, 3)), Camera((4, 3)), 0)
-    with pytest.raises(ArgumentError, match="failed fit"):
-        replace(given.links[0], relation=failed)
+    lenses = [Camera((640, 480), -0.25), Camera((640, 480))]
+    for wrong, says in (
+        (lambda: align(cameras, [link, link]), "same images"),
+        (lambda: align(cameras[:1], [link]), "outside of the 1"),
+        (lambda: align(lenses, [link], AlignmentOptions(lens_known=True)), "lenses that differ"),
+        (lambda: AlignmentOptions(model="affine"), "model must be"),
+        (lambda: AlignmentOptions(lens="brown"), "lens must be one of .*division-center"),
+        (lambda: replace(link, image2=0), "with itself"),
+        (lambda: replace(link, points1=link.points1 * np.nan), "not finite"),
+        (lambda: replace(link, relation=failed), "failed fit"),
+    ):
+        with pytest.raises(ArgumentError, match=says):
+            wrong()
+    with pytest.raises(RegistrationError, match="no two images overlap"):
+        align(cameras, [])
 
 
 @pytest.mark.parametrize(

@@ -11,13 +11,12 @@ import pytest
 
 from examples.worlds.alignment_scenes import Scene, aligned, grid_scene
 from examples.worlds.lens_scenes import FISHEYE, SIZE, lens_distance, lens_scene
-from rdstitch.alignment import LENSES, Alignment, AlignmentOptions
+from rdstitch.alignment import LENSES, Alignment
 from rdstitch.alignment.adjustment_problem import LinkProblem
 from rdstitch.alignment.lens import lens_selection
 from rdstitch.alignment.lens.lens_description import describe_lens, radius_std
 from rdstitch.alignment.lens.lens_selection import LensChoice, free_parameters
 from rdstitch.alignment.pairwise import pairwise_homographies
-from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from tests.alignment_stubs import adjusted, independent_errors, observations
 from tests.sampled import sampled
@@ -168,11 +167,6 @@ def test_a_known_lens_is_kept_whole() -> None:
     assert found.distortion_std == 0.0
     assert found.rms < 0.6
     assert described(found) == (f"λ = {found.distortion:.6f}, given",)
-
-
-def test_an_unknown_lens_is_refused() -> None:
-    with pytest.raises(ArgumentError, match="division-center"):
-        AlignmentOptions(lens="brown")
 
 
 def test_the_description_says_what_is_needed() -> None:

@@ -44,7 +44,6 @@ def test_wrong_arguments_are_refused(wrong: dict[str, object], says: str) -> Non
 def test_a_pair_is_checked_where_it_is_made() -> None:
     points, lens = MATCHES.points1, LENS.with_focal()
     for wrong, says in (
-        ((points, points[1:], lens, lens), "differ in length"),
         ((points, points * np.nan, lens, lens), "not finite"),
         ((points, points, lens, Camera((640, 480))), "focal length"),
         ((points, points, lens, lens, np.ones(3)), "quality must have shape"),
