@@ -30,9 +30,8 @@ UNLIKE = 0.4  # correlation below which edges on both sides are not the same
 # Share of the overlaps that images of a scene reach where they do not belong, in nine of ten cases (0.1 in the median);
 # and share that what fills less than half of the images cannot reach.
 _CHANCE, _MIN_ALIKE = 0.2, 0.5
-# Coherence of edges (0: all directions, 1: one) from which on a person sees them end: brightness changes twice as much
-# across as along. Leaves, branches and gravel hide a seam.
-_DIRECTED = 0.6
+# Coherence of edges (0: all directions, 1: one) from which on a person sees them end: leaves and gravel hide a seam.
+_DIRECTED = 0.4
 _MAX_SHARE, _MIN_BROKEN = 0.03, 3  # of the places that may be broken before a person sees it
 _MAX_LENGTH = 0.045  # of a break that a person does not see, diagonals of an image
 _SURELY_ALIKE = 0.9  # correlation of windows that need not be moved
