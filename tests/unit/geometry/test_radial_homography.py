@@ -97,7 +97,7 @@ def test_conjugate_gradients_reach_zero_from_a_start_that_is_not() -> None:
     right = np.array([[0.0, 4.0], [0.0, 4.0]])
     with np.errstate(all="raise", under="ignore"):
         found = conjugate_gradients(matrix, right, np.array([[3.0, 3.0], [-3.0, 1.0]]), lambda left: left / 5.0, 1e-9)
-    assert_allclose(found, [[0.0, 1.0], [0.0, 1.0]], atol=1e-8)
+    np.testing.assert_allclose(found, [[0.0, 1.0], [0.0, 1.0]], atol=1e-8)
 
 
 def test_conjugate_gradients_stop_where_a_matrix_is_not_positive() -> None:
