@@ -59,7 +59,9 @@ def rendered(kind: str, seed: int) -> Sequence:
         rotations = panorama_rotations(5, 0.55 * SIZE[0] / focal_length(lens), jitter=0.06, seed=seed)
         return turning_sequence(lens, rotations, seed=seed, photometry=PHOTOMETRY)
     if kind == "fisheye":
-        lens = FisheyeLens(SIZE, float(rng.uniform(150.0, 230.0)))
+        focal = float(rng.uniform(150.0, 230.0))
+        off = rng.normal(0.0, 0.02, 2) * HALF
+        lens = FisheyeLens(SIZE, focal, offset=(float(off[0]), float(off[1])))
     if kind == "drive":
         tilt = tuple(rng.uniform(-0.12, 0.12, 2).tolist())
         poses = drive_poses(lens, "line", 7, overlap=0.7, heading=float(rng.uniform(-3.0, 3.0)), tilt=tilt)
