@@ -45,10 +45,7 @@ def with_ground_control(
     """
     if file is None:
         return list(sources)
-    text = read_text(file)
-    first, _, rest = text.partition("\n")
-    system = NamedSystem.named_by(first)
-    body = f"\n{rest}" if system else text  # lines keep their numbers
+    system, body = NamedSystem.above(read_text(file))
     rows: Iterable[Row]
     header = next((line for line in body.splitlines() if line.strip()), "")
     if re.match(r"\W*[A-Za-z_ ./()]+[,;\t]", header):

@@ -36,6 +36,14 @@ class NamedSystem:
             return None
         return cls(text, _code_of(terms))
 
+    @classmethod
+    def above(cls, text: str) -> "tuple[NamedSystem | None, str]":
+        """The system that the first line names that is no comment, and the lines below; these keep their numbers."""
+        lines = text.splitlines()
+        first = next((n for n, line in enumerate(lines) if not re.match(r"\s*(#|$)", line)), 0)
+        system = cls.named_by(lines[first]) if lines else None
+        return (None, text) if system is None else (system, "\n".join([""] * (first + 1) + lines[first + 1 :]))
+
     def geographic(self, places: ArrayLike) -> FloatArray:
         """Latitude and longitude (N, 2) on WGS 84, degrees, of coordinates (N, 2) in the system's order x, y."""
         points = np.asarray(places, dtype=np.float64).reshape(-1, 2)

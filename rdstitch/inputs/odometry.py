@@ -11,14 +11,14 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
-from rdstitch.inputs.tables import TIME_NAMES, Row, csv_rows, is_number, numbered_lines
+from rdstitch.inputs.tables import TIME_NAMES, csv_rows, is_number, numbered_lines
 from rdstitch.system.file_access import cached_by_file_state, read_text
 
 _COLUMNS = {"timestamp": TIME_NAMES} | {
     name: name.replace("_", "")
     for name in ("x", "y", "yaw", "yaw_deg", "qx", "qy", "qz", "qw", "cov_x_x", "cov_y_y", "cov_yaw_deg_yaw_deg")
 }
-_LISTED = ("timestamp", "x", "y", "z", "qx", "qy", "qz", "qw")  # in TUM's lines
+_LISTED = 8  # numbers in TUM's lines
 _SLIP = 0.02  # share of distances and turns that wheels are off by if they do not say
 
 
@@ -74,13 +74,12 @@ def read_odometry(file: str | Path) -> Odometry:
     """
     text, where = read_text(file), str(file)
     lines = numbered_lines(text, where)
-    if lines and is_number(lines[0][1].split()[0]) and len(lines[0][1].split()) == len(_LISTED):
-        rows = [_listed_pose(*line) for line in lines]
-    else:
-        wanted = ("timestamp,x,y,yaw_deg", "timestamp,x,y,yaw", "timestamp,x,y,qx,qy,qz,qw")
-        rows = csv_rows(text, where, _COLUMNS, wanted, ("s", "m", "deg", "rad"))
+    first = lines[0][1] if lines else ""
+    if len(first.split()) == _LISTED and is_number(first.split()[0]) and not set(",;") & set(first):
+        return odometry_of([_listed_pose(*line) for line in lines], where)
+    wanted = ("timestamp,x,y,yaw_deg", "timestamp,x,y,yaw", "timestamp,x,y,qx,qy,qz,qw")
     table = []
-    for row in rows:
+    for row in csv_rows(text, where, _COLUMNS, wanted, ("s", "m", "deg", "rad")):
         yaw = row.number("yaw")
         if yaw is None and (degrees := row.number("yaw_deg")) is not None:
             yaw = math.radians(degrees)
@@ -93,11 +92,12 @@ def read_odometry(file: str | Path) -> Odometry:
     return odometry_of(table, where)
 
 
-def _listed_pose(where: str, line: str) -> Row:
+def _listed_pose(where: str, line: str) -> tuple[float, ...]:
     parts = line.split()
-    if len(parts) != len(_LISTED) or not all(map(is_number, parts)):
+    if len(parts) != _LISTED or not all(map(is_number, parts)):
         raise InputError(f"{where}: expected timestamp tx ty tz qx qy qz qw, found '{line}'")
-    return Row(where, dict(zip(_LISTED, parts, strict=True)), ".")
+    time, x, y, _, *turn = map(float, parts)
+    return time, x, y, yaw_of(*turn), math.nan, math.nan
 
 
 def odometry_of(rows: Sequence[tuple[float, ...]], where: str) -> Odometry:

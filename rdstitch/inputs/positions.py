@@ -1,4 +1,4 @@
-"""Where images were taken: in metres by their GPS, which a table, exiftool or a track may say instead of EXIF.
+"""Where images were taken by EXIF, or by what a user has instead: a table, the output of exiftool, or a track.
 
 ================================= ====================================================================
 CSV with a header                 a name, and latitude and longitude, or x and y; as ``exiftool -csv`` too
@@ -98,7 +98,6 @@ def with_positions(
 def _places(sources: Sequence[Source], file: str | Path, epsg: int | None, offset: float) -> list[GpsPosition | None]:
     text, name = read_text(file), str(file)
     system = None if epsg is None else NamedSystem(f"EPSG:{epsg}", epsg)
-    lines = text.split("\n", 1)
     if text.lstrip().startswith("<"):
         places = on_track(sources, track_points(text, name), name, offset)
     elif points := subtitle_points(text):
@@ -106,10 +105,11 @@ def _places(sources: Sequence[Source], file: str | Path, epsg: int | None, offse
     elif is_list_of_events(text):
         places = by_events(sources, text, name)
     else:
+        named, below = NamedSystem.above(text)
         if text.lstrip().startswith(("[", "{")):
             rows = json_rows(text, name, COLUMNS, _RECORDS)
-        elif (named := NamedSystem.named_by(lines[0])) is not None:
-            rows, system = listed_rows("".join(lines[1:]), name, _LISTED, 2), named
+        elif named is not None:
+            rows, system = listed_rows(below, name, _LISTED), named
         else:
             rows = csv_rows(text, name, COLUMNS, _WANTED, UNITS)
         named_rows = RowsByImage(row for row in rows if _coordinates(row) is not None)

@@ -239,7 +239,12 @@ def _pixels(path: Path, message: Any) -> NDArray[Any]:
     kind, channels, to_bgr = _ENCODINGS[message.encoding]
     dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     rows = np.asarray(message.data, dtype=np.uint8)[: message.height * message.step].reshape(message.height, -1)
-    samples = np.ascontiguousarray(rows).view(dtype).astype(kind)[:, : message.width * channels]
+    needed = message.width * channels
+    if message.step < needed * dtype.itemsize:
+        raise InputError(
+            f"{path}: rows of {message.step} bytes are too short for {message.width} pixels of {message.encoding}"
+        )
+    samples = np.ascontiguousarray(rows).view(dtype).astype(kind)[:, :needed]
     if channels > 1:
         samples = samples.reshape(message.height, message.width, channels)
     return samples if to_bgr is None else np.asarray(cv2.cvtColor(samples, to_bgr))

@@ -145,16 +145,16 @@ def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> 
     )
 
 
-def numbered_lines(text: str, file: str, first: int = 1) -> list[tuple[str, str]]:
+def numbered_lines(text: str, file: str) -> list[tuple[str, str]]:
     """Where each line is, for messages, and what it says, but for empty ones and those that begin with ``#``."""
-    lines = ((f"{file}: line {n}", line.strip()) for n, line in enumerate(text.splitlines(), start=first))
+    lines = ((f"{file}: line {n}", line.strip()) for n, line in enumerate(text.splitlines(), start=1))
     return [(where, line) for where, line in lines if line and not line.startswith("#")]
 
 
-def listed_rows(text: str, file: str, columns: Sequence[str], first_line: int = 1) -> list[Row]:
+def listed_rows(text: str, file: str, columns: Sequence[str]) -> list[Row]:
     """Lines of a name, which may hold blanks, and numbers between blanks; see :func:`numbered_lines`."""
     rows = []
-    for where, line in numbered_lines(text, file, first_line):
+    for where, line in numbered_lines(text, file):
         fields = line.split()
         count = len(list(takewhile(_readings, reversed(fields[1:]))))
         name = line.rsplit(maxsplit=count)[0]

@@ -150,6 +150,9 @@ def test_odometry_is_read_from_tum_and_refused_by_line(tmp_path: Path) -> None:
     file.write_text("1 0 0 0 0 0 0 1\n2 1 0.5 0 0 0 one 1\n", encoding="utf-8")
     with pytest.raises(InputError, match="line 2"):
         read_odometry(file)
+    # Eight columns are a table where there are commas.
+    file.write_text("# timestamp,x,y,z,qx,qy,qz,qw\n1 ,0 ,0 ,0 ,0 ,0 ,0 ,1\n2 ,1 ,0 ,0 ,0 ,0 ,0 ,1\n", encoding="utf-8")
+    assert read_odometry(file).at(1.5)[:3] == pytest.approx((0.5, 0.0, 0.0))
 
 
 def test_turns_by_more_than_half_a_circle_are_bridged_the_way_they_were_made() -> None:

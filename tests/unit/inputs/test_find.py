@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import cv2
@@ -12,7 +13,7 @@ from PIL import Image
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.find import find_images
 from rdstitch.inputs.frame import Frame
-from rdstitch.inputs.rosbag import _eight_bits, _grey_of_compressed
+from rdstitch.inputs.rosbag import _ENCODINGS, _eight_bits, _grey_of_compressed, _pixels
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import video as video_reader
@@ -35,13 +36,14 @@ def test_what_is_no_image_in_a_folder_is_named_once(tmp_path: Path) -> None:
     images(tmp_path / "set", 2)
     (tmp_path / "set" / "notes.txt").write_text("x")
     (tmp_path / "set" / ".hidden").write_text("x")
-    (tmp_path / "set" / "1.CR2").write_bytes(b"the same image")
+    Image.new("L", (32, 24)).save(tmp_path / "set" / "x.png")
+    (tmp_path / "set" / "X.CR2").write_bytes(b"the same image")
     video(tmp_path / "set" / "clip.avi")
     found = find_images([tmp_path / "set"])
-    assert [frame.path.name for frame in found.frames] == ["0.png", "1.png"]
+    assert [frame.path.name for frame in found.frames] == ["0.png", "1.png", "x.png"]
     assert {message.severity for message in found.messages} == {"detail"}
     versions, others = (message.text for message in found.messages)
-    assert versions.endswith("are raw or HEIC versions of images that are taken: 1.CR2")
+    assert versions.endswith("are raw or HEIC versions of images that are taken: X.CR2")
     assert others.endswith("not taken for images: clip.avi, notes.txt")
 
 
@@ -164,6 +166,39 @@ def test_compressed_images_are_decoded() -> None:
     for suffix, samples, off in ((".png", grey, 0), (".png", SMOOTH, 0), (".jpg", grey, 4)):
         found = _grey_of_compressed(cv2.imencode(suffix, samples)[1])
         assert np.abs(found.astype(int) - samples).max() <= off
+
+
+def _message(encoding: str, samples: np.ndarray, padding: int = 0, *, big: bool = False) -> SimpleNamespace:
+    """A message of ROS with an image (H, W, C), whose rows end with some bytes more or less."""
+    height, width, _ = samples.shape
+    rows = samples.astype(samples.dtype.newbyteorder(">" if big else "<")).reshape(height, -1).view(np.uint8)
+    rows = np.pad(rows, ((0, 0), (0, max(padding, 0))))[:, : rows.shape[1] + padding]
+    size = {"height": height, "width": width, "step": rows.shape[1]}
+    return SimpleNamespace(encoding=encoding, is_bigendian=big, data=rows.ravel(), **size)
+
+
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("encoding", _ENCODINGS)
+def test_uncompressed_images_are_read_in_every_encoding(encoding: str, big: bool) -> None:
+    kind = np.uint16 if "16" in encoding else np.uint8
+    bgra = np.random.default_rng(3).integers(0, np.iinfo(kind).max, (6, 8, 4), dtype=kind)
+    if pattern := re.fullmatch("bayer_(....)8", encoding):
+        bgra[:] = bgra[0, 0]
+        samples = np.tile(bgra[0, 0, ["bgr".index(letter) for letter in pattern[1]]].reshape(2, 2), (3, 4))[..., None]
+    else:
+        channels = {"C1": "b", "C3": "bgr", "C4": "bgra"}.get(encoding[-2:], encoding.rstrip("0123456789"))
+        samples = bgra[..., ["bgra".index(letter) for letter in channels.replace("mono", "b")]]
+    found = _pixels(Path("a.bag"), _message(encoding, samples, 4, big=big))
+    np.testing.assert_array_equal(found, bgra[..., :3] if found.ndim == 3 else bgra[..., 0])
+    assert (found.ndim == 3) == (pattern is not None or samples.shape[2] > 1)
+
+
+@pytest.mark.parametrize(("encoding", "missing"), [("mono8", 1), ("mono16", 8), ("bayer_rggb8", 2), ("bgr8", 3)])
+def test_rows_that_are_too_short_for_an_image_are_refused(encoding: str, missing: int) -> None:
+    kind, channels, _ = _ENCODINGS[encoding]
+    message = _message(encoding, np.zeros((6, 8, channels), kind), -missing)
+    with pytest.raises(InputError, match=rf"a\.bag: rows of {message.step} bytes are too short for 8 pixels"):
+        _pixels(Path("a.bag"), message)
 
 
 def test_of_a_deep_image_eight_bits_are_the_same_at_any_exposure() -> None:

@@ -77,6 +77,7 @@ def _read(folder: Path, text: str, epsg: int | None = None, offset: float = 0.0)
         "# Name;Lat [deg];Lon [deg];Alt (m)\n"
         "C:\\flight\\a.jpg;48,8582222222;-2,2945;35,5\nb.jpg;-48,8582222222;2,2945\n",
         "EPSG:4326\na.jpg -2.2945 48.8582222222 35.5 0 0 0\n\nb.jpg 2.2945 -48.8582222222\n",
+        "\n# of flight 3\nEPSG:4326\na.jpg -2.2945 48.8582222222 35.5\nb.jpg 2.2945 -48.8582222222\n",
     ],
 )
 def test_tables(tmp_path: Path, text: str) -> None:
@@ -111,6 +112,7 @@ def test_projected_coordinates(tmp_path: Path, head: str) -> None:
         ("33d 51m 0s S", "W122d30m0s"),
         ("\u221233.85", "-122.5"),
         ("33.85S", "122.5W"),
+        ("33.85S", "-122.5"),
         ("33.85 S", '"122°30\'0"" W"'),
         ('"33 deg 51\' 0.00"" S"', "122.5 W"),
     ],
@@ -207,6 +209,7 @@ def test_projected_numbers_in_other_notations_and_zero_longitude(tmp_path: Path)
     [
         ("1 2 3 4 5 a.jpg", "line 1: expected a coordinate system"),
         ("EPSG:4326\n1 2 3 4 a.jpg", "line 2: expected X Y Z PX PY IMAGE"),
+        ("\n# surveyed\nEPSG:4326\n1 2 3 4 a.jpg", "line 4: expected X Y Z PX PY IMAGE"),
         ("EPSG:4326\n1 2 3 640 5 a.jpg", "line 2: is not within the 640 x 480 pixels of a.jpg"),
         ("EPSG:4326\n1 2 3 nan 5 a.jpg", "line 2: has no number for px"),
         ("EPSG:4326\n1 2 3 4 5 z.jpg", "has no ground control point in any of the images"),

@@ -114,12 +114,12 @@ def test_a_row_is_about_the_image_whose_path_ends_like_its_name(
 
 
 def test_names_in_lists_hold_blanks() -> None:
-    rows = listed_rows("DJI 0001 (2).jpg 12.5 48 -3\n# no\n\nb.jpg 1 2", "geo.txt", ("name", "x", "y"), 2)
+    rows = listed_rows("DJI 0001 (2).jpg 12.5 48 -3\n# no\n\nb.jpg 1 2", "geo.txt", ("name", "x", "y"))
     assert [(row.image, row.number("x"), row.number("y")) for row in rows] == [
         ("DJI 0001 (2).jpg", 12.5, 48.0),
         ("b.jpg", 1.0, 2.0),
     ]
-    assert rows[1].where == "geo.txt: line 5"
+    assert rows[1].where == "geo.txt: line 4"
 
 
 def test_zero_in_json_is_a_number() -> None:

@@ -202,8 +202,11 @@ def test_the_limit_of_memory_knows_channels_and_depth(
         file.write_bytes(cv2.imencode(".png", samples)[1].tobytes())
     else:
         tifffile.imwrite(file, samples, planarconfig="contig", photometric="minisblack")
-    for factor, message in ((0.9, f"100 x {shape[0]} pixels take .* set {MAX_IMAGE_GB}"), (None, "expected a number")):
-        monkeypatch.setenv(MAX_IMAGE_GB, "much" if factor is None else str(factor * samples.nbytes / 1e9))
+    for setting, message in (
+        (str(0.9 * samples.nbytes / 1e9), f"100 x {shape[0]} pixels take .* set {MAX_IMAGE_GB}"),
+        ("much", f"{MAX_IMAGE_GB}=much: expected a number"),
+    ):
+        monkeypatch.setenv(MAX_IMAGE_GB, setting)
         for read in (read_metadata, read_image):
             with pytest.raises(InputError, match=message):
                 read(file)

@@ -92,13 +92,14 @@ def test_strips_do_not_matter(tmp_path_factory: pytest.TempPathFactory, suffix: 
         np.testing.assert_array_equal(a.pixels, b.pixels)
 
 
+@pytest.mark.parametrize("opaque", [False, True])
 @pytest.mark.parametrize("suffix", ["jpg", "png", "tif", "ome.tif", "webp"])
-def test_same_bytes_every_time(tmp_path: Path, suffix: str) -> None:
+def test_same_bytes_every_time(tmp_path: Path, suffix: str, opaque: bool) -> None:
     pixels, written = _image(600, 700, 3, np.uint8), set()
     alpha = np.full(pixels.shape[:2], 255, np.uint8)
     alpha[:90], alpha[:, 640:] = 0, 0
     for write in range(8):
-        write_image(tmp_path / f"a.{suffix}", pixels, alpha)
+        write_image(tmp_path / f"a.{suffix}", pixels, None if opaque else alpha)
         written.add((tmp_path / f"a.{suffix}").read_bytes())
         # Whatever the compressor finds in memory must not matter.
         np.random.default_rng(write).bytes(300_000 + 10_000 * write)
@@ -242,7 +243,7 @@ def test_tiff_is_cloud_optimized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     alpha = np.full(pixels.shape[:2], 255, np.uint8)
     alpha[:130] = 0
     exif = Image.Exif()
-    exif[ExifTags.Base.Make] = "Maker of cameras\0\0\0"  # as cameras pad it
+    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Maker of camera\0\0\0", "Camera 1\0"  # as cameras pad them
     write_image(tmp_path / "a.tif", pixels, alpha, Metadata((1100, 700), exif=exif.tobytes(), dpi=(300.0, 300.0)))
     with tifffile.TiffFile(tmp_path / "a.tif") as tiff:
         pages = list(tiff.pages)
@@ -256,8 +257,10 @@ def test_tiff_is_cloud_optimized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         assert at[-1] < first[-1]
         assert all(offset % 2 == 0 for page in pages for offset in (page.offset, *page.dataoffsets))
         tags = tiff.pages.first.tags
-        assert tags["Make"].count == len("Maker of cameras\0")
-        assert (tags["Make"].value, tags["XResolution"].value) == ("Maker of cameras", (300, 1))
+        assert tags["Make"].count == len("Maker of camera\0")
+        assert [tags[name].value for name in ("Make", "Model")] == ["Maker of camera", "Camera 1"]
+        assert b"Maker of camera\0\0" not in (tmp_path / "a.tif").read_bytes()
+        assert tags["XResolution"].value == (300, 1)
         np.testing.assert_array_equal(
             tiff.asarray()[..., :channels] if channels > 1 else tiff.asarray(), pixels.squeeze()
         )
