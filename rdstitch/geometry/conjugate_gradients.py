@@ -19,10 +19,11 @@ def conjugate_gradients(
 ) -> FloatArray:
     """The solution (K, C) of ``matrix x = right`` up to a residual, as a share of the right side.
 
-    The columns are solved side by side: a product with the matrix is most of a step, and one serves them all.
+    Of a right side of zeros it is a share of the residual at the start. The columns are solved side by side: a product
+    with the matrix is most of a step, and one serves them all.
     """
     x, left, ones = start, right - matrix @ start, np.ones(len(right))
-    enough = tolerance**2 * (right**2).sum(axis=0)
+    enough = tolerance**2 * np.where(right.any(axis=0), (right**2).sum(axis=0), (left**2).sum(axis=0))
     direction, previous, definite = np.zeros_like(x), np.ones(x.shape[1]), np.ones(x.shape[1], dtype=np.bool_)
     for _ in range(_MAX_STEPS):
         going = definite & (ones @ left**2 > enough)

@@ -92,6 +92,14 @@ def test_cameras_are_of_whole_pixels_and_can_be_compared() -> None:
             Camera(size)  # type: ignore[arg-type]
 
 
+def test_conjugate_gradients_reach_zero_from_a_start_that_is_not() -> None:
+    matrix = np.array([[5.0, -1.0], [-1.0, 5.0]])
+    right = np.array([[0.0, 4.0], [0.0, 4.0]])
+    with np.errstate(all="raise", under="ignore"):
+        found = conjugate_gradients(matrix, right, np.array([[3.0, 3.0], [-3.0, 1.0]]), lambda left: left / 5.0, 1e-9)
+    np.testing.assert_allclose(found, [[0.0, 1.0], [0.0, 1.0]], atol=1e-8)
+
+
 def test_conjugate_gradients_stop_where_a_matrix_is_not_positive() -> None:
     right = np.ones((2, 1))
     found = conjugate_gradients(np.diag([1.0, -1.0]), right, np.zeros((2, 1)), lambda left: left, 1e-9)
