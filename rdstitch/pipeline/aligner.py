@@ -10,6 +10,7 @@ import numpy as np
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
 from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
+from rdstitch.alignment.near_copies import without_measurements
 from rdstitch.choices import Purpose
 from rdstitch.errors import ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import Camera
@@ -149,7 +150,8 @@ class Aligner:
             copies = {}
             related = distinct(pairs, copies)
         reference = self.options.reference
-        near = {copy: first for copy, first in near_copies_of(related).items() if copy != reference}
+        options = replace(self.options, reference=None if reference is None else copies.get(reference, reference))
+        near = without_measurements(near_copies_of(related), options)
         evidence = [ends for ends in related if not near.keys() & {*ends}]
         if not evidence:
             near, evidence = {}, [*related]
@@ -161,7 +163,6 @@ class Aligner:
         if (size := common_size(cameras, links)) is not None:
             cameras = tuple(framed_camera(camera, size) for camera in cameras)
             links = tuple(framed_link(link, size) for link in links)
-        options = replace(self.options, reference=None if reference is None else copies.get(reference, reference))
         task = AlignmentTask(cameras, links[: len(evidence)], options, near, links[len(evidence) :])
         compared, twice = [related[pair].images for pair in evidence], copies | near
 
@@ -189,7 +190,7 @@ class Aligner:
         sizes = [self._quarters.back.camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
         if any(camera.image_size != size for camera, size in zip(alignment.cameras, sizes, strict=True)):
             alignment = cut_alignment(alignment, sizes)
-        return self._quarters.alignment(alignment, task.options.gravity)
+        return self._quarters.alignment(alignment, task.options.gravity, task.near_copies)
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
         """A draft of the same pairs by a model with metric poses, where the user left the choice of the model open."""
