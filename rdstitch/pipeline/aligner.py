@@ -1,5 +1,6 @@
 """Stages: registered pairs become one alignment, which finds more pairs, which make a better alignment."""
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_
 from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.alignment.near_copies import without_measurements
+from rdstitch.alignment.result import LinkFit, Unused
 from rdstitch.choices import Purpose
 from rdstitch.errors import ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import Camera
@@ -149,8 +151,9 @@ class Aligner:
         if not related:  # all images show the same
             copies = {}
             related = distinct(pairs, copies)
-        reference = self.options.reference
-        options = replace(self.options, reference=None if reference is None else copies.get(reference, reference))
+        if (reference := self.options.reference) is not None:
+            reference = copies.get(reference, reference)
+        options = replace(self.options, reference=reference)
         near = without_measurements(near_copies_of(related), options)
         evidence = [ends for ends in related if not near.keys() & {*ends}]
         if not evidence:
@@ -169,6 +172,7 @@ class Aligner:
         def complete(stage: str, compute: Callable[[], Alignment]) -> Alignment:
             alignment = self._recalled(stage, task, compute)
             alignment = alignment.with_copies(copies, compared)
+            alignment = replace(alignment, links=(*alignment.links, *self._links_of_copies(alignment, pairs)))
             return alignment.with_messages([self._counted_once(twice)] if twice else [])
 
         return AlignedPairs(
@@ -176,6 +180,16 @@ class Aligner:
             complete("draft", lambda: task.draft),
             completed=lambda: complete("alignment", lambda: task.result),
         )
+
+    def _links_of_copies(self, alignment: Alignment, pairs: Sequence[PairRegistration]) -> Iterator[LinkFit]:
+        """How well the registered pairs agree that are no evidence."""
+        known = {fit.images for fit in alignment.links}
+        for pair in pairs:
+            if pair.relation and pair.images not in known:
+                errors = pair.errors(alignment.transfer)[pair.relation.inliers]
+                good = errors[errors < self.threshold]
+                rms = float(np.sqrt(np.mean(good**2))) if len(good) else math.nan
+                yield LinkFit(*pair.images, len(errors), len(good), rms, used=False, reason=Unused.COPY)
 
     def _counted_once(self, twice: Iterable[int]) -> Message:
         names = shortened(names_of(self.paths[k] for k in sorted(twice)))

@@ -168,7 +168,7 @@ def viewed_images(result: StitchResult) -> list[ViewedImage]:
     """The images of a result with what was found of each."""
     alignment, registration = result.registration.alignment, result.registration
     names = [source.name for source in registration.sources]
-    links_of = links_by_image(fit for fit in alignment.links if fit.used)
+    links_of = links_by_image(alignment.holding)
     viewed = []
     for outlines, index in zip(result.canvas.outlines, np.flatnonzero(alignment.used).tolist(), strict=True):
         source = registration.sources[index]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rdstitch.alignment.result import LinkFit
+from rdstitch.alignment.result import LinkFit, Unused
 from rdstitch.choices import Purpose
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
@@ -182,6 +182,13 @@ def test_images_of_whose_matches_two_fifths_disagree_are_named() -> None:
     assert "b.jpg has less than a third of the features that others have (blurred?)" in second.text
     assert second.images == ("folder/b.jpg",)
     assert _misfits(100, agree=0.65) == []
+
+
+@pytest.mark.parametrize("inliers", [20, 55, 65])
+def test_a_copy_is_judged_by_its_own_matches(inliers: int) -> None:
+    links = LinkFit(0, 1, 100, 90, 0.5, True), LinkFit(0, 2, 100, inliers, 0.5, False, Unused.COPY)
+    found = [*rules._misfitting_images(evidence(registration(3, links=links, keypoints=(900,) * 3)))]
+    assert [finding.images for finding in found] == [(2,)] * (inliers < 60)
 
 
 def _texts(*sources: Source) -> list[str]:
