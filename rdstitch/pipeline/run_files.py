@@ -22,7 +22,8 @@ from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import OutputImage, StitchResult
-from rdstitch.system.outputs import Outputs, check_not_read, check_outputs, check_suffix, text_bytes
+from rdstitch.system.output_checks import check_not_read, check_outputs, check_suffix
+from rdstitch.system.outputs import Outputs, text_bytes
 from rdstitch.viewer.page import ViewedImage, viewer_page, viewer_path
 
 

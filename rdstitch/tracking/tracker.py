@@ -35,8 +35,8 @@ class FrameTracker:
 
     Features (``detect``, in a frame's pixels; ``match``) are asked for only where the corners of the last keyframe,
     followed from frame to frame, do not place a frame. Keyframes are aligned by ``executor`` while further frames come;
-    where a tracker is ``patient`` these are waited for, so that the same frames give the same poses, else no frame
-    waits long. Where λ is known both options have it.
+    where a tracker is ``patient`` alignments are waited for, so that the same frames give the same poses, else no
+    frame waits long. Where λ is known both options have it.
     """
 
     def __init__(
@@ -222,7 +222,8 @@ class FrameTracker:
             if self._map.has_plane:
                 reason = "it is not linked with the map yet"
         elif placed.aligned and pose is None:
-            reason = "the model has no metric poses"
+            metric = placed.placement.focal is not None
+            reason = "its place is not finite" if metric else "the model has no metric poses"
         return replace(
             self._unplaced(placed.frame, reason),
             placement=placed.placement if placed.aligned else None,

@@ -21,6 +21,7 @@ from rdstitch.features.corner_flow import CornerFlow, corners_of, matched_corner
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
+from rdstitch.inputs.delays import DELAYS
 from rdstitch.inputs.keyframes import fitted_affine
 from rdstitch.inputs.odometry import BodyPose
 from rdstitch.robust import EstimationOptions
@@ -114,6 +115,15 @@ def _check(results: list[TrackingResult], sequence: Sequence) -> None:
 def test_the_path_and_lambda_come_near_thetrue_path(tracked: list[TrackingResult], drive: Sequence) -> None:
     _check(tracked, drive)
     assert abs(tracked[-1].distortion - DISTORTION) < 0.003
+
+
+def test_a_frame_whose_place_is_not_finite_is_told_so(drive: Sequence) -> None:
+    known = EstimationOptions(distortion=DISTORTION), AlignmentOptions(tilt=(0.0, 0.0), lens_known=True)
+    tracker = FrameTracker(*known, MADE_UP.__getitem__, partial(match, ratio=0.8), ThreadPoolExecutor(1))
+    camera = Camera(SIZE, DISTORTION, focal=256.0, focal_source="option")
+    attitudes = [np.full((len(DELAYS), 2), angle) for angle in (0.0, 0.0, np.nan)]
+    *_, last = [tracker.add(f, camera, a)[-1] for f, a in zip(_frames(drive), attitudes, strict=False)]
+    assert (last.pose, last.reason) == (None, "its place is not finite")
 
 
 def test_a_lambda_that_is_given_is_kept(drive: Sequence) -> None:
