@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.alignment.motion_models import MODELS
+from rdstitch.alignment.motion_models import LOG_HEIGHT, MODELS, PSI, THETA, YAW, X, Y
 from rdstitch.arrays import FloatArray, Rows
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rigid_in_plane
@@ -57,6 +57,11 @@ class PlanarPoses(Rows):
     # used, where they were asked for
     covariance: FloatArray | None = None
     with_first: FloatArray | None = None
+
+    @classmethod
+    def of(cls, metric: FloatArray) -> Self:
+        """Of poses (N, 6) in metric units, in the columns of the planar models; no covariances."""
+        return cls(metric[:, YAW], metric[:, [X, Y]], np.exp(metric[:, LOG_HEIGHT]), metric[:, [PSI, THETA]])
 
     def relative_to(self, reference: int) -> "PlanarPoses":
         """The poses in the frame of one image: at the origin, with yaw zero, its height the unit; no covariances."""

@@ -11,6 +11,7 @@ import numpy as np
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
 from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
+from rdstitch.alignment.near_copies import without_measurements
 from rdstitch.alignment.result import LinkFit, Unused
 from rdstitch.choices import Purpose
 from rdstitch.errors import ImpossibleCameraError, RegistrationError
@@ -152,7 +153,8 @@ class Aligner:
             related = distinct(pairs, copies)
         if (reference := self.options.reference) is not None:
             reference = copies.get(reference, reference)
-        near = {copy: first for copy, first in near_copies_of(related).items() if copy != reference}
+        options = replace(self.options, reference=reference)
+        near = without_measurements(near_copies_of(related), options)
         evidence = [ends for ends in related if not near.keys() & {*ends}]
         if not evidence:
             near, evidence = {}, [*related]
@@ -164,7 +166,6 @@ class Aligner:
         if (size := common_size(cameras, links)) is not None:
             cameras = tuple(framed_camera(camera, size) for camera in cameras)
             links = tuple(framed_link(link, size) for link in links)
-        options = replace(self.options, reference=reference)
         task = AlignmentTask(cameras, links[: len(evidence)], options, near, links[len(evidence) :])
         compared, twice = [related[pair].images for pair in evidence], copies | near
 
@@ -203,7 +204,7 @@ class Aligner:
         sizes = [self._quarters.back.camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
         if any(camera.image_size != size for camera, size in zip(alignment.cameras, sizes, strict=True)):
             alignment = cut_alignment(alignment, sizes)
-        return self._quarters.alignment(alignment, task.options.gravity)
+        return self._quarters.alignment(alignment, task.options.gravity, task.near_copies)
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
         """A draft of the same pairs by a model with metric poses, where the user left the choice of the model open."""

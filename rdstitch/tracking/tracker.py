@@ -17,7 +17,7 @@ from rdstitch.inputs.odometry import BodyPose
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
-from rdstitch.tracking.camera_check import revise_camera
+from rdstitch.tracking.camera_check import check_given_camera
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.frame_links import agree
 from rdstitch.tracking.keyframe_map import KeyframeMap
@@ -189,16 +189,10 @@ class FrameTracker:
 
     def _with_checked_camera(self, latest: TrackedFrame) -> list[TrackingResult]:
         """Earlier frames whose places are others, or surer, by what keyframes show of a camera that was given."""
-        focal, revision = self._knowledge.focal, revise_camera(self._map, latest.frame)
-        for message in revision.messages:
-            self._report(message)
+        focal, changed = self._knowledge.focal, check_given_camera(self._map, latest.frame, self._report)
         if self._knowledge.focal != focal:
             self._refinement.drop()
-        if revision.length_factor is not None:
-            self._map.rescale(revision.length_factor)
-        elif not revision.report_again:
-            return []
-        return self._revised(self._map.revise(), latest)
+        return self._revised(self._map.revise(), latest) if changed else []
 
     def _take_over(self, latest: TrackedFrame | None, patience: float | None) -> list[TrackingResult]:
         return self._revised(self._refinement.take_over(self._map, patience), latest)

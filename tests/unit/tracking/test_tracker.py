@@ -24,6 +24,7 @@ from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.inputs.delays import DELAYS
 from rdstitch.inputs.keyframes import fitted_affine
 from rdstitch.inputs.odometry import BodyPose
+from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, blank, sequence_over
 from rdstitch.tracking import (
@@ -33,7 +34,7 @@ from rdstitch.tracking import (
     Preview,
     TrackingResult,
 )
-from rdstitch.tracking.camera_check import CameraRevision, revise_camera
+from rdstitch.tracking.camera_check import check_given_camera
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.map_refinement import MapRefinement
@@ -345,8 +346,11 @@ def test_keyframes_by_odometry_are_no_measurement_of_it() -> None:
 
 
 def test_keyframes_without_links_show_nothing_of_the_camera() -> None:
-    keyframe_map = KeyframeMap(_given_camera(), [_keyframe(23), _keyframe(24)], has_plane=True, added=24)
-    assert revise_camera(keyframe_map, keyframe_map.keyframes[-1].frame) == CameraRevision()
+    knowledge, messages = _given_camera(), list[Message]()
+    before = replace(knowledge)
+    keyframe_map = KeyframeMap(knowledge, [_keyframe(23), _keyframe(24)], has_plane=True, added=24)
+    assert not check_given_camera(keyframe_map, keyframe_map.keyframes[-1].frame, messages.append)
+    assert (knowledge, messages) == (before, [])
 
 
 def test_an_alignment_that_is_dropped_keeps_no_worker_busy() -> None:
