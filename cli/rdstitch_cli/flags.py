@@ -136,7 +136,7 @@ class Flag(click.Option):
 
 def _check_not_read(written: Iterable[Path], camera: Path | None) -> None:
     """Refuse to write over the camera file that is read, or over the configuration."""
-    from rdstitch.system.outputs import check_not_read
+    from rdstitch.system.output_checks import check_not_read
 
     read = (camera, click.get_current_context().meta.get(CONFIG_FILE))
     check_not_read(written, [file for file in read if file is not None])

@@ -173,7 +173,7 @@ def _real(files: Many[Path]) -> Table:
             if isinstance(registration, str):
                 rows.append(_failed(variant, registration, ("",)))
             else:
-                agreeing = sum(fit.inliers for fit in registration.alignment.links)
+                agreeing = sum(registration.alignment.support.values())
                 rows.append((*_told(variant, registration), agreeing))
     return Table(f"Fig. 10: copr, {len(files)} real images, {_COPR}", (*_TOLD, "matches that agree"), tuple(rows))
 

@@ -148,6 +148,29 @@ def _relation(
     )
 
 
+def turn_links(
+    lens: Camera, rotations: FloatArray, rng: np.random.Generator, noise: float = 0.2, count: int = 120
+) -> list[Link]:
+    """Links, with their true homographies, between all images that overlap of a camera that turns on the spot."""
+    k = np.diag([(lens.focal or lens.scale) / lens.scale] * 2 + [1.0])
+    links = []
+    for i in range(len(rotations)):
+        for j in range(i + 1, len(rotations)):
+            h = k @ rotations[j] @ rotations[i].T @ np.linalg.inv(k)
+            points = rng.uniform((0, 0), np.array(lens.image_size) - 1.0, (count, 2))
+            flat = lens.normalize(lens.undistort(points))
+            moved = np.column_stack([flat, np.ones(count)]) @ h.T
+            moved[moved[:, 2] <= 0.05] = np.nan
+            seen = lens.distort(lens.denormalize(moved[:, :2] / moved[:, 2:]))
+            inside = ((seen >= 0) & (seen < lens.image_size)).all(axis=1)
+            if inside.sum() < 20:
+                continue
+            noisy = [p[inside] + noise * rng.standard_normal((int(inside.sum()), 2)) for p in (points, seen)]
+            relation = RadialHomography(h, lens, lens, np.ones(len(noisy[0]), dtype=np.bool_), distortion_std=0.01)
+            links.append(Link(i, j, noisy[0], noisy[1], relation))
+    return links
+
+
 def jittered(poses: FloatArray, height: float, tilt: float, rng: np.random.Generator) -> FloatArray:
     """Poses of a drone in wind: heights by up to ±``height`` and normal tilts of ``tilt``, radians."""
     result = poses.copy()

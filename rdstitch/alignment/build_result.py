@@ -10,13 +10,10 @@ import numpy as np
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.alignment_options import GivenImages
 from rdstitch.alignment.frames.level_frame import levelled
-from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, FreeParameters
 from rdstitch.alignment.least_squares.link_equations import squared_lengths, whitened_errors
-from rdstitch.alignment.least_squares.observations import Observations
-from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.lens.lens_description import radius_std
 from rdstitch.alignment.lens.lens_selection import CENTER, ENOUGH_IMAGES, LensChoice
-from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
+from rdstitch.alignment.near_copies import with_near_copies
 from rdstitch.alignment.noise import coherence
 from rdstitch.alignment.result import Alignment, LinkFit, PlanarPoses, ReliefTest, Unused
 from rdstitch.alignment.select import ModelChoice
@@ -37,7 +34,7 @@ from rdstitch.geometry.radial_homography import inverses
 from rdstitch.matching.match_graph import connected_components
 from rdstitch.results.messages import Message
 from rdstitch.robust.loss import ALIGNMENT_WIDTH
-from rdstitch.robust.posterior import MODEL_ERROR, exact
+from rdstitch.robust.posterior import MODEL_ERROR
 
 _STEP = 1e-5  # of differences of λ, μ and ν
 _RADII = np.linspace(0.05, 1.0, 20)  # half diagonals: where the lens is looked at, out to the corner
@@ -156,42 +153,9 @@ def build_alignment(adjusted: AdjustedImages) -> Alignment:
         lever_std=lever_std(adjusted.problem, fit) if has_lever else 0.0,
         messages=_messages(adjusted, cameras[reference]),
     )
-    return _with_near_copies(alignment, adjusted) if adjusted.given.near_copies else alignment
-
-
-def _with_near_copies(alignment: Alignment, adjustment: AdjustedImages) -> Alignment:
-    """The alignment with near copies of its images, placed by their links to it; they change nothing else."""
-    given, problem, fit = adjustment.given, adjustment.problem, adjustment.choice.fit
-    original = {k: k for k in adjustment.images.tolist()}
-    original |= {copy: first for copy, first in given.near_copies.items() if first in original}
-    images = np.array(sorted(original), dtype=np.intp)
-    number = np.full(len(given.cameras), -1, dtype=np.intp)
-    number[images] = np.arange(len(images))
-    links = [link for link in given.links_of_copies if link.image1 in original and link.image2 in original]
-    model, start = fit.model, fit.adjusted.parameters
-    firsts = np.searchsorted(adjustment.images, [original[k] for k in images.tolist()])
-    start = replace(start, poses=start.poses[firsts])
-    free = np.repeat(~np.isin(images, adjustment.images)[:, None], model.pose_size, axis=1)
-    held = tuple(map(exact, model.physical_parameters(start.shared)[0].tolist()))
-    adjuster = BundleAdjuster(
-        model,
-        Observations.from_links(links, given.cameras).subset(np.arange(len(links)), number),
-        FreeParameters(free, np.zeros_like(problem.free_lens)),
-        replace(Priors.none(model, len(images)), shared=held),
-    )
-    every = replace(
-        adjustment,
-        given=replace(given, options=replace(given.options, pose_covariance=False)),
-        images=images,
-        problem=replace(problem, fixed=int(number[alignment.reference])),
-        choice=replace(adjustment.choice, fit=replace(fit, adjusted=adjuster.run(start))),
-    )
-    homographies, poses = _in_frame_of_reference(every)
-    result = alignment.with_copies(given.near_copies, [link.images for link in alignment.links])
-    if poses is not None and result.poses is not None:
-        known = result.poses  # how well a copy is known is how well its image is
-        poses = replace(poses, covariance=known.covariance, with_first=known.with_first)
-    return replace(result, homographies=homographies, poses=poses)
+    if not adjusted.given.near_copies:
+        return alignment
+    return with_near_copies(alignment, adjusted.given, adjusted.images, adjusted.all_links, fit)
 
 
 def _adjusted_cameras(adjusted: AdjustedImages) -> tuple[Camera, ...]:
@@ -259,10 +223,9 @@ def _in_frame_of_reference(adjusted: AdjustedImages) -> tuple[FloatArray, Planar
     if not model.has_metric_poses:
         return of_all(matrices[reference] @ inverses(matrices)), None
     metric = model.metric_poses(parameters.poses, parameters.shared)
-    yaw, position = metric[:, YAW], metric[:, [X, Y]]
-    height, tilt = np.exp(metric[:, LOG_HEIGHT]), metric[:, [PSI, THETA]]
-    frame = rigid_in_plane(yaw[reference], position[reference], height[reference])
-    poses = PlanarPoses(yaw, position, height, tilt).relative_to(reference)
+    poses = PlanarPoses.of(metric)
+    frame = rigid_in_plane(poses.yaw[reference], poses.position[reference], poses.height[reference])
+    poses = poses.relative_to(reference)
     wanted = adjusted.given.options.pose_covariance and adjusted.covariance is not None
     covariances = pose_covariances(adjusted.problem, adjusted.fit) if wanted else ()
     aligned_poses = (poses.yaw, poses.position, poses.height, poses.tilt, *covariances)

@@ -10,7 +10,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.alignment.motion_models import MODELS
+from rdstitch.alignment.motion_models import LOG_HEIGHT, MODELS, PSI, THETA, YAW, X, Y
 from rdstitch.arrays import FloatArray, Rows
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rigid_in_plane
@@ -19,11 +19,12 @@ from rdstitch.results.messages import Message
 
 
 class Unused(StrEnum):
-    """Why a link was not used although it fits well on its own."""
+    """Why the alignment was not adjusted to a link that fits well on its own."""
 
     NO = ""
     CONTRADICTS = "contradicts the other links"
     ELSEWHERE = "belongs to another group of images"
+    COPY = "counted once: one of its images is a copy"
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,11 @@ class PlanarPoses(Rows):
     # used, where they were asked for
     covariance: FloatArray | None = None
     with_first: FloatArray | None = None
+
+    @classmethod
+    def of(cls, metric: FloatArray) -> Self:
+        """Of poses (N, 6) in metric units, in the columns of the planar models; no covariances."""
+        return cls(metric[:, YAW], metric[:, [X, Y]], np.exp(metric[:, LOG_HEIGHT]), metric[:, [PSI, THETA]])
 
     def relative_to(self, reference: int) -> "PlanarPoses":
         """The poses in the frame of one image: at the origin, with yaw zero, its height the unit; no covariances."""
@@ -241,6 +247,11 @@ class Alignment:
     def support(self) -> dict[tuple[int, int], int]:
         """Number of inliers of every pair of images that the alignment uses."""
         return {(fit.image1, fit.image2): fit.inliers for fit in self.links if fit.used}
+
+    @cached_property
+    def holding(self) -> list[LinkFit]:
+        """The links by which every image is where it is: those that are used, and those of copies that agree."""
+        return [fit for fit in self.links if fit.used or (fit.reason is Unused.COPY and 2 * fit.inliers >= fit.count)]
 
     def transfer(self, image1: int, image2: int, points: FloatArray) -> FloatArray:
         """Where points (N, 2) of one image, pixels, are in another; NaN where its lens cannot see them."""

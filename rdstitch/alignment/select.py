@@ -99,6 +99,7 @@ class Posterior:
 
     def scored(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
+        # Of any model what its errors show, whatever its freedom costs: it is held against what seams can hide.
         field = float(self.evidence.cost(fit.adjusted.errors).field[0])
         layout = stretch(fit) if self.purpose.picture else 1.0
         spread = (fit.tilt_spread or 0.0) / _TYPICAL_TILT_SPREAD
@@ -229,7 +230,7 @@ def _score(one: Hypothesis) -> float:
 
 
 def _is_beyond_one_camera(posterior: Posterior, best: Hypothesis, free: float) -> bool:
-    """Whether free homographies with such a field compete; two images need no more than one."""
+    """Whether free homographies compete, of a picture whatever their field is; two images need no more than one."""
     largest = posterior.tolerable if posterior.purpose.picture else _MIN_RATIO * free
     return posterior.problem.count == 2 or best.implausible or best.field > largest
 

@@ -99,7 +99,10 @@ def few_images(count: int, enough: int, off: float, purpose: Purpose) -> Message
 
 
 def not_converged(purpose: Purpose) -> Message:
-    """Of seven on adverse sets two results were off (python -m examples.benchmarks.trust --kind adverse)."""
+    """That the adjustment did not converge: of seven such results two were off.
+
+    Of adverse sets: ``python -m examples.benchmarks.trust --kind adverse``.
+    """
     text = "the adjustment did not converge, from another start neither, so that λ is not known; add images"
     return Message(text, severity=purpose.unknown_lens, code="not-converged")
 

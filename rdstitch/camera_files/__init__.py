@@ -116,6 +116,8 @@ def _of_content(content: Any, file: str, image_size: ImageSize | None) -> Camera
             name, entry = _only(matching)
             own = entry.get(OWN)
             return read(entry, file, str(name)) if own is None else _own(own, file, f"{name}.{OWN}")
+    if "format" not in dict(entries):
+        raise ArgumentError("is no camera file of a known format")
     return _own(content, file)
 
 

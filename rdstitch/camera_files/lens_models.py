@@ -116,7 +116,7 @@ def nearest_model(camera: Camera, names: Mapping[str, str], close: float = CLOSE
     tangential terms kept.
     """
     lens, fits = camera.lens_model, []
-    kinds: dict[str, LensKind] = {model: "fisheye" if model == "fisheye" else "brown" for model in names}
+    kinds: dict[str, LensKind] = {model: kind_of(model == "fisheye") for model in names}
     if lens is not None and math.isclose(lens.mean_focal, camera.focal or 0.0):
         for model, kind in kinds.items():
             count = len(_MODELS[model][1])
@@ -133,6 +133,11 @@ def nearest_model(camera: Camera, names: Mapping[str, str], close: float = CLOSE
         if fits[-1][1].largest <= close:
             break
     return min(fits, key=lambda one: one[1].largest)
+
+
+def kind_of(fisheye: bool) -> LensKind:
+    """The word for a model of OpenCV."""
+    return "fisheye" if fisheye else "brown"
 
 
 def _without_radial_terms(camera: Camera, kind: LensKind) -> LensModel:

@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from rdstitch.camera_files.lens_models import CameraFile, fitted_camera, nearest_model
+from rdstitch.camera_files.lens_models import CameraFile, fitted_camera, kind_of, nearest_model
 from rdstitch.camera_files.own_record import OWN, Written, as_yaml, comments, own_record
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.lens_model import LensKind, LensModel
+from rdstitch.geometry.lens_model import LensModel
 from rdstitch.system.records import Count, Side, convert
 
 ImageSize = Callable[[], tuple[int, int]]
@@ -76,7 +76,8 @@ def read_opencv(content: dict[str, Any], file: str, image_size: ImageSize | None
     """
     named = {_ALIASES.get(name, name): value for name, value in content.items()}
     for name, rows in (("camera_matrix", 3), ("distortion_coefficients", 1)):
-        if isinstance(values := named.get(name), list):  # as ``ros2 topic echo`` prints them
+        if isinstance(given := named.get(name), list):  # as ``ros2 topic echo`` prints them; or row by row
+            values = [value for row in given for value in (row if isinstance(row, list) else [row])]
             named[name] = {"rows": rows, "cols": len(values) // rows, "data": values}
     record = convert(named, _OpenCV, file, strict=False)
     matrix, k = record.camera_matrix, tuple(record.distortion_coefficients.data)
@@ -112,11 +113,6 @@ def read_opencv(content: dict[str, Any], file: str, image_size: ImageSize | None
             'are that, add "fisheye_model: 1", else "distortion_model: plumb_bob"'
         )
     return brown
-
-
-def kind_of(fisheye: bool) -> LensKind:
-    """The word for a model of OpenCV."""
-    return "fisheye" if fisheye else "brown"
 
 
 def _is_rather(fisheye: CameraFile, brown: CameraFile) -> bool:

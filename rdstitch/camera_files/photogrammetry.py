@@ -7,8 +7,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from rdstitch.camera_files.lens_models import CameraFile, fitted_camera, nearest_model
-from rdstitch.camera_files.opencv import kind_of
+from rdstitch.camera_files.lens_models import CameraFile, fitted_camera, kind_of, nearest_model
 from rdstitch.camera_files.own_record import OWN, Written, as_yaml, comments, own_record
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera

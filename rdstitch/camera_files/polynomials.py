@@ -164,7 +164,11 @@ def fitted_polynomial(camera: Camera, unit: float, powers: tuple[int, ...]) -> P
 
 def read_lensfun(text: str, file: str, image_size: Callable[[], tuple[int, int]] | None) -> CameraFile:
     """Fit λ to the only lens of a file at its only focal length; the crop factor is that of the images."""
-    lenses = list(parse_xml(text, file).iter("lens"))
+    root = parse_xml(text, file)
+    if root.tag == "opencv_storage":
+        raise ArgumentError("is OpenCV's in XML, which is not read; save it as YAML or JSON, by a name like camera.yml")
+    if not (lenses := list(root.iter("lens"))):
+        raise ArgumentError("is XML, but no lens of lensfun's database")
     profiles = [(lens, item) for lens in lenses for item in lens.iter("distortion")]
     if len(profiles) != 1:
         what = f"{len(lenses)} lenses with {len(profiles)} distortions"

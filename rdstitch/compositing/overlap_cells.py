@@ -16,6 +16,7 @@ from rdstitch.system.late_imports import sparse
 
 # Along the longest side of an image or an overlap, and of all overlaps together: of thousands, each needs fewer.
 _CELLS, _MAX_CELLS = 16, 150_000
+_CLIPPED, _MOMENTS = 4, 5  # means of a cell after those of its samples: see _cells_of_overlap
 _SAMPLES = 10  # pixels along each side of a cell that are looked at, at least, where it has so many
 # Integer samples outside this part of the range are clipped or mostly noise.
 _DARKEST, BRIGHTEST = 0.02, 0.97
@@ -89,7 +90,7 @@ def compare_overlaps(survey: Survey) -> Cells | None:
     if not any(len(of_pair) for of_pair, _, _ in found):
         return None
     pair, middles, means = (np.concatenate(each) for each in zip(*found, strict=True))
-    samples, clipped_share, moments = np.split(means, [-9, -5], axis=1)
+    samples, clipped_share, moments = np.split(means, [-_CLIPPED - _MOMENTS, -_MOMENTS], axis=1)
     full = full_scale(next(iter(shown.values())).tile.pixels.dtype)
     values = np.moveaxis(samples.reshape(len(means), 2, -1), 1, 0) / full
     images, clipped, points = pairs[pair].T, clipped_share.T > 0.5, np.empty((2, len(pair), 2))

@@ -118,7 +118,7 @@ def measure_seams(
     pixels of the tiles long; ``unit`` is pixels of the output for one of the tiles, ``full`` the grey level of white.
     """
     pairs, at = _border_places(labels, label_size)
-    searchable: dict[int, list[BoolArray]] = {}
+    searchable: dict[int, dict[int, BoolArray]] = {}  # by image
     found: list[tuple[IntArray, FloatArray, _Verdict]] = []
     for pair in np.unique(pairs, axis=0):
         first, second = (tiles[k] for k in pair)
@@ -157,11 +157,11 @@ def _border_places(labels: NDArray[np.int32], label_size: float) -> tuple[IntArr
     return every[middle, :2].astype(np.intp), every[middle, 2:]
 
 
-def _searchable(inside: BoolArray) -> list[BoolArray]:
-    """Where windows can be searched for in an image (h, w), by each reach."""
-    kernels = [np.ones((2 * (_HALF + reach) + 1,) * 2, np.uint8) for reach in _REACHES]
-    opaque = inside.astype(np.uint8)
-    return [cv2.erode(opaque, k, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)) > 0 for k in kernels]
+def _searchable(inside: BoolArray) -> dict[int, BoolArray]:
+    """Where windows can be searched for in an image (h, w), by reach."""
+    kernels = {reach: np.ones((2 * (_HALF + reach) + 1,) * 2, np.uint8) for reach in _REACHES}
+    opaque, outside = inside.astype(np.uint8), cv2.BORDER_CONSTANT
+    return {reach: cv2.erode(opaque, k, borderType=outside, borderValue=(0,)) > 0 for reach, k in kernels.items()}
 
 
 class _Verdict(NamedTuple):
@@ -172,13 +172,13 @@ class _Verdict(NamedTuple):
 
 
 def _comparable_places(
-    first: tuple[SeamTile, list[BoolArray]], second: tuple[SeamTile, list[BoolArray]], at: FloatArray
+    first: tuple[SeamTile, dict[int, BoolArray]], second: tuple[SeamTile, dict[int, BoolArray]], at: FloatArray
 ) -> tuple[FloatArray, IntArray]:
     """Those of the places (N, 2) of one border where windows fit into both tiles, and how far they can be searched."""
     whole, reaches = np.rint(at).astype(np.intp), np.zeros(len(at), dtype=np.intp)
     (tile1, areas1), (tile2, areas2) = first, second
-    for mask1, mask2, reach in zip(areas1, areas2, _REACHES, strict=True):
-        reaches[_looked_up(mask1, tile1.box, whole) & _looked_up(mask2, tile2.box, whole)] = reach
+    for reach in _REACHES:
+        reaches[_looked_up(areas1[reach], tile1.box, whole) & _looked_up(areas2[reach], tile2.box, whole)] = reach
     return at[reaches > 0], reaches[reaches > 0]
 
 

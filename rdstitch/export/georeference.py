@@ -1,4 +1,4 @@
-"""Where the output lies on the Earth, as GeoTIFF tags, as a world file, and in words.
+"""The output's place on the Earth: as GeoTIFF tags, as a world file, and in words.
 
 The output is a plane seen straight from above, so that a similarity takes its pixels to map coordinates. See
 :mod:`rdstitch.export.map_fit` for how it is fitted.

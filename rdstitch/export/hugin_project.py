@@ -71,11 +71,12 @@ def _image_lines(alignment: Alignment, used: list[int], files: Sequence[Path]) -
 def _control_lines(
     registration: Registration, alignment: Alignment, used: list[int], quarters: QuarterTurns
 ) -> list[str]:
-    """Control points of all pairs that support the alignment, as pixels of the files."""
+    """Control points of all pairs that hold the images, as pixels of the files."""
+    holding = {fit.images for fit in alignment.holding}
     number = {k: place for place, k in enumerate(used)}
     lines = []
     for pair in registration.pairs:
-        if pair.images not in alignment.support or not set(pair.images) <= number.keys():
+        if pair.images not in holding or not set(pair.images) <= number.keys():
             continue
         (i, j), link = pair.images, pair.link().thinned(_CONTROL_POINTS)
         first, second = (

@@ -18,7 +18,8 @@ from rdstitch.io.tiff import ExtraTag
 from rdstitch.results.stitch_result import OutputImage
 from rdstitch.system.late_imports import tifffile
 from rdstitch.system.native_threads import one_native_thread
-from rdstitch.system.outputs import Outputs, check_outputs, file_name
+from rdstitch.system.output_checks import check_outputs
+from rdstitch.system.outputs import Outputs, file_name
 
 _DPI = 150  # offsets are counted in inches; any resolution will do
 _X_POSITION, _Y_POSITION, _FULL_WIDTH, _FULL_LENGTH = 286, 287, 33300, 33301

@@ -82,7 +82,8 @@ class Detection:
     points: FloatArray  # (N, 2): places, pixels of the image
     scale: FloatArray  # (N,): diameters, pixels
     response: FloatArray  # (N,): strengths, in units of the detector
-    describe: Callable[[NDArray[np.intp]], Features]  # features of the keypoints of some indices
+    # features of the keypoints of some indices, in an order of the detector's own, and without those it cannot describe
+    describe: Callable[[NDArray[np.intp]], Features]
 
     def take(self, index: NDArray[np.intp]) -> "Detection":
         """The keypoints of the given indices, in their order."""

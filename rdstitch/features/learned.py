@@ -32,10 +32,10 @@ def detect_aliked(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection
     rows = np.array([(*k.pt, k.response) for k in keypoints], dtype=np.float64).reshape(-1, 3)
     if descriptors is None:
         descriptors = np.zeros((0, network.descriptorSize()))
+    finite = np.isfinite(rows).all(axis=1)
+    rows, described = rows[finite], np.asarray(descriptors, np.float32)[finite]
     points, response, ones = rows[:, :2], rows[:, 2], np.ones(len(rows))
-    features = Features(
-        points, np.asarray(descriptors, np.float32), ones, np.zeros(len(rows)), response, None, kind="aliked"
-    )
+    features = Features(points, described, ones, np.zeros(len(rows)), response, None, kind="aliked")
     return Detection(points, ones, response, features.take)
 
 

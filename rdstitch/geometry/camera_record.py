@@ -11,7 +11,8 @@ from msgspec import UNSET, Meta, Struct, UnsetType, field
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
 from rdstitch.system.file_access import read_text
-from rdstitch.system.outputs import check_output, json_bytes, write_bytes_atomic
+from rdstitch.system.output_checks import check_output
+from rdstitch.system.outputs import json_bytes, write_bytes_atomic
 from rdstitch.system.records import NonNegative, Pair, Size, Triple, convert, parse_json, to_jsonable
 
 VERSION = 2

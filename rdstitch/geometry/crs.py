@@ -73,6 +73,8 @@ class Crs:
     def nearest(cls, latitude: ArrayLike, longitude: ArrayLike) -> "Crs":
         """UTM on WGS 84 in the zone of the middle of places (N,), degrees; UPS near the poles."""
         phi, away = middle(latitude, longitude)
+        if not (abs(phi) <= 90.0 and math.isfinite(away)):
+            raise ArgumentError(f"no zone of UTM has its middle at {phi:g}, {away:g} degrees")
         return cls(epsg_of(_zone_at(phi, away) * (1 if phi >= 0 else -1)))
 
     @property

@@ -6,6 +6,8 @@ A caller says which columns it knows and what else they are called, and which of
     for row in csv_rows(text, file, COLUMNS, ("name,x,y",), units=("m",)):
         row.image, row.number("x"), row.number("y")
 
+Lists that are no tables are read line by line: :func:`numbered_lines`.
+
 Headings count without regard to case, blanks, underscores and a group (``EXIF:``). A unit in brackets belongs to the
 heading where the caller knows it so (``x (um)`` is ``xum``); else it must be one of ``units``. The delimiter is the
 comma, semicolon or tab that is in the heading most often. Lines that begin with ``#`` say nothing, except that the

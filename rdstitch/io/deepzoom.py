@@ -16,7 +16,7 @@ from rdstitch.io.pyramid import pyramid, pyramid_sizes
 from rdstitch.io.read import read_image
 from rdstitch.io.strips import ImageSpec, Strip, as_eight_bit, with_alpha
 from rdstitch.io.write_jpeg import jpeg_pieces
-from rdstitch.system.outputs import tiles_folder
+from rdstitch.system.output_checks import tiles_folder
 
 MAX_TILE_PROFILE = 2**16
 """Bytes of a colour profile that is written into every tile; the larger ones of RGB images have 60 kB."""

@@ -8,7 +8,7 @@ import numpy as np
 from rdstitch.errors import LimitError, OutputError
 from rdstitch.io.ome_zarr import check_zarr
 from rdstitch.io.strips import ImageSpec
-from rdstitch.system.outputs import check_suffix
+from rdstitch.system.output_checks import check_suffix
 
 
 @dataclass(frozen=True)

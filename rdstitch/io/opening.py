@@ -31,7 +31,8 @@ RAW_SUFFIXES = frozenset(
     (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw", ".nrw", ".iiq", ".3fr", ".erf")
 )
 """What TIFF readers see in raw files is their thumbnail."""
-_PACKAGES = ((HEIF_SUFFIXES, "pillow_heif"), (RAW_SUFFIXES, "rawpy"))
+
+_PACKAGES = ((HEIF_SUFFIXES, "pillow_heif"), (RAW_SUFFIXES, "rawpy"))  # what reads them, where it is installed
 
 # What Pillow, tifffile and OpenCV have been seen to raise on damaged files; warnings, where filters make them errors.
 _DAMAGE = (

@@ -26,7 +26,8 @@ from rdstitch.io.tiff import ExtraTag, write_tiff
 from rdstitch.io.write_jpeg import jpeg_pieces
 from rdstitch.io.write_png import png_pieces
 from rdstitch.results.messages import Message
-from rdstitch.system.outputs import Fingerprint, Outputs, check_folder, fingerprint, is_zarr, naming, tiles_folder
+from rdstitch.system.output_checks import check_folder, is_zarr, naming, tiles_folder
+from rdstitch.system.outputs import Fingerprint, Outputs, fingerprint
 
 _TIFF = (".tif", ".tiff")
 _JPEG = (".jpg", ".jpeg")

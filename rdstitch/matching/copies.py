@@ -16,7 +16,7 @@ _SAME_PX = 0.5
 """Pixels that matches of a copy move by at most: saving again moves them by less, and no place is off by more."""
 
 _MIN_SAME = 0.9  # share of the matches that do: of an image that shows something else beside what is static, more move
-_NEAR = 0.02  # of the width and the height, that matches of a near copy move by at most: an overlap of 98 %
+_NEAR = 0.02  # of the width and the height, that matches of a near copy move by at most: an overlap of 97 % at least
 
 
 def copies_of(pairs: Sequence[PairRegistration]) -> dict[int, int]:

@@ -61,7 +61,7 @@ class FilesBeside(Options):
         if self.whole_layers and self.layers is None:
             raise ArgumentError("whole layers need a folder of layers: --whole-layers goes with --layers DIR")
         if self.report is not None:
-            from rdstitch.system.outputs import check_suffix
+            from rdstitch.system.output_checks import check_suffix
 
             check_suffix(self.report, _REPORT_SUFFIXES)
 

@@ -220,6 +220,9 @@ def _fits(value: Any, kind: Any, option: Option) -> bool:
     if kind in (int, float):
         number = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
         return number and option.allows(value)
+    if isinstance(kind, ForwardRef):  # names of classes that are not imported here; what is like an array, NumPy says
+        known, names = kind.__forward_arg__.split(" | "), {base.__name__ for base in type(value).__mro__}
+        return "ArrayLike" in known or isinstance(value, PathLike) or not names.isdisjoint(known)
     return isinstance(value, {str: str, Path: PathLike, bool: bool}.get(kind, object))
 
 
@@ -228,6 +231,8 @@ def _in_words(kind: Any, option: Option) -> str:
     if get_origin(kind) is tuple:
         parts = get_args(kind)
         return f"{len(parts)} numbers{unit}{option.limits}" if parts[-1] is not Ellipsis else "a list"
+    if isinstance(kind, ForwardRef):
+        return f"{kind.__forward_arg__.split()[0]} or a file"
     names = {
         bool: "true or false",
         int: f"a whole number{unit}{option.limits}",

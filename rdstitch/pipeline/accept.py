@@ -130,8 +130,8 @@ def _worst(checked: _Checked) -> Rejected:
         pairs = [finding for finding in failures if finding.kind.scope is Scope.PAIR]
         said = zip(pairs, messages_of(pairs, registration), strict=True)
         return {finding.images: message.text for finding, message in said}
-    used = [fit for fit in registration.alignment.links if fit.used]
-    fit_share, links_of = agreement(used, len(registration.sources)), links_by_image(used)
+    links = registration.alignment.holding
+    fit_share, links_of = agreement(links, len(registration.sources)), links_by_image(links)
     chosen = dict[tuple[int, ...], str]()
     beside: set[int] = set()
     for image in sorted(single, key=lambda k: (fit_share[k], k)):

@@ -1,5 +1,6 @@
 """Stages: registered pairs become one alignment, which finds more pairs, which make a better alignment."""
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -10,6 +11,8 @@ import numpy as np
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
 from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
+from rdstitch.alignment.near_copies import without_measurements
+from rdstitch.alignment.result import LinkFit, Unused
 from rdstitch.choices import Purpose
 from rdstitch.errors import ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import Camera
@@ -148,8 +151,10 @@ class Aligner:
         if not related:  # all images show the same
             copies = {}
             related = distinct(pairs, copies)
-        reference = self.options.reference
-        near = {copy: first for copy, first in near_copies_of(related).items() if copy != reference}
+        if (reference := self.options.reference) is not None:
+            reference = copies.get(reference, reference)
+        options = replace(self.options, reference=reference)
+        near = without_measurements(near_copies_of(related), options)
         evidence = [ends for ends in related if not near.keys() & {*ends}]
         if not evidence:
             near, evidence = {}, [*related]
@@ -161,13 +166,13 @@ class Aligner:
         if (size := common_size(cameras, links)) is not None:
             cameras = tuple(framed_camera(camera, size) for camera in cameras)
             links = tuple(framed_link(link, size) for link in links)
-        options = replace(self.options, reference=None if reference is None else copies.get(reference, reference))
         task = AlignmentTask(cameras, links[: len(evidence)], options, near, links[len(evidence) :])
         compared, twice = [related[pair].images for pair in evidence], copies | near
 
         def complete(stage: str, compute: Callable[[], Alignment]) -> Alignment:
             alignment = self._recalled(stage, task, compute)
             alignment = alignment.with_copies(copies, compared)
+            alignment = replace(alignment, links=(*alignment.links, *self._links_of_copies(alignment, pairs)))
             return alignment.with_messages([self._counted_once(twice)] if twice else [])
 
         return AlignedPairs(
@@ -175,6 +180,16 @@ class Aligner:
             complete("draft", lambda: task.draft),
             completed=lambda: complete("alignment", lambda: task.result),
         )
+
+    def _links_of_copies(self, alignment: Alignment, pairs: Sequence[PairRegistration]) -> Iterator[LinkFit]:
+        """How well the registered pairs agree that are no evidence."""
+        known = {fit.images for fit in alignment.links}
+        for pair in pairs:
+            if pair.relation and pair.images not in known:
+                errors = pair.errors(alignment.transfer)[pair.relation.inliers]
+                good = errors[errors < self.threshold]
+                rms = float(np.sqrt(np.mean(good**2))) if len(good) else math.nan
+                yield LinkFit(*pair.images, len(errors), len(good), rms, used=False, reason=Unused.COPY)
 
     def _counted_once(self, twice: Iterable[int]) -> Message:
         names = shortened(names_of(self.paths[k] for k in sorted(twice)))
@@ -189,7 +204,7 @@ class Aligner:
         sizes = [self._quarters.back.camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
         if any(camera.image_size != size for camera, size in zip(alignment.cameras, sizes, strict=True)):
             alignment = cut_alignment(alignment, sizes)
-        return self._quarters.alignment(alignment, task.options.gravity)
+        return self._quarters.alignment(alignment, task.options.gravity, task.near_copies)
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
         """A draft of the same pairs by a model with metric poses, where the user left the choice of the model open."""

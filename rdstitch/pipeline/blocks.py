@@ -55,7 +55,7 @@ def mosaic_blocks(
     results: list[StitchResult] = []
     refused: list[Message] = []
     began = started(inputs, options, Purpose.MOSAIC, file, every=every, progress=progress, beside=beside)
-    with began as (listed, run, outputs), ExitStack() as stack:  # all are published together
+    with began as (listed, run, outputs), ExitStack() as stack:  # all are published together, once the cache is gone
         # What was found of images and pairs serves the next block.
         cache = options.cache or stack.enter_context(TemporaryFolder())
         listed = replace(

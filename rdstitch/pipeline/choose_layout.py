@@ -221,4 +221,5 @@ def _differs(registration: Registration, allowed: float, other: Alignment, *, st
         before, after = (one.transfer(i, j, points) for one in (alignment, other))
         inside = ((before >= 0.0) & (before < alignment.cameras[j].image_size)).all(axis=1)
         moved.append(np.linalg.norm(after - before, axis=1)[inside] / (2.0 * alignment.cameras[j].scale))
-    return not np.quantile(np.concatenate(moved), _SHIFT_QUANTILE, method="higher") <= _MIN_SHIFT
+    shifts = np.nan_to_num(np.concatenate(moved), nan=np.inf)  # where a lens cannot see them
+    return not np.quantile(shifts, _SHIFT_QUANTILE, method="higher") <= _MIN_SHIFT

@@ -11,7 +11,10 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 
-from rdstitch.errors import InputError, RdstitchError
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rdstitch.errors import ArgumentError, InputError, RdstitchError
 from rdstitch.executors import ProcessExecutor
 from rdstitch.features import FeatureOptions, Features, detect_view, match
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
@@ -140,8 +143,8 @@ class Tracker:
         self,
         image: Image,
         timestamp: float | None = None,
-        attitude: tuple[float, float] | None = None,
-        odometry: tuple[float, float, float] | None = None,
+        attitude: ArrayLike | None = None,
+        odometry: ArrayLike | None = None,
     ) -> Pose:
         """Register the next frame.
 
@@ -153,10 +156,10 @@ class Tracker:
             s.
         attitude : (float, float), optional
             Tilt (ψ, θ) of this frame, radians, as an IMU has measured it, with ``attitude_std`` of the options; instead
-            of a table of them.
+            of a table of them. Without a place is a frame whose tilt is NaN.
         odometry : (float, float, float), optional
             x (ahead), y (to the left) and yaw (radians, counterclockwise from above) of the robot's body by its wheels;
-            instead of a table of them.
+            instead of a table of them. NaN is none.
 
         Returns
         -------
@@ -164,17 +167,20 @@ class Tracker:
             False, with the reason, where the frame has no place, or not yet: those of the first frames come later, in
             :attr:`revised`.
         """
+        time = None if timestamp is None else _measured("timestamp", timestamp)[0]
+        tilt = None if attitude is None else _measured("attitude", attitude, 2)
+        wheels = (math.nan,) if odometry is None else _measured("odometry", odometry, 3)
+        body = BodyPose(*wheels) if all(map(math.isfinite, wheels)) else None
         number = next(self._numbers)
         (named,) = as_inputs(image, self._options.channel_order)
         frame = replace(named, path=Path(f"image_{number:04d}")) if isinstance(named, Frame) else Frame(Path(named))
-        frame = replace(frame, number=number, timestamp=timestamp)
-        body = None if odometry is None else BodyPose(*odometry)
-        *revised, pose = self.register(frame, *self.read(frame, attitude), body)
+        frame = replace(frame, number=number, timestamp=time)
+        *revised, pose = self.register(frame, *self.read(frame, tilt), body)
         self.revised = tuple(revised)
         return pose
 
     def read(
-        self, frame: Frame, attitude: tuple[float, float] | None = None
+        self, frame: Frame, attitude: Sequence[float] | None = None
     ) -> tuple[Source | None, PreparedImage | None, str]:
         """The frame as a source, and as it is tracked; or why it is not."""
         options, features = self._options, self._detection
@@ -183,8 +189,10 @@ class Tracker:
         sources, unread = read_frames([frame], options, InputGuard(options.strict), skip_bad=True)
         if not sources:
             return None, None, unread[0].text
-        source, megapixels = replace(sources[0], attitude=attitude and MeasuredTilt(attitude)), self._megapixels
+        source, megapixels = sources[0], self._megapixels
         try:
+            if attitude is not None:
+                source = replace(source, attitude=_tilt(*attitude))
             (source,) = self._measured(source)
             view = source.view(megapixels)
             return source, prepare(view, megapixels, stretch=features.stretch, equalize=bool(features.equalize)), ""
@@ -231,6 +239,26 @@ class Tracker:
         revisable = self._frames.revisable
         self._labels = {number: known for number, known in self._labels.items() if number in revisable}
         return poses
+
+
+def _measured(name: str, value: ArrayLike, *shape: int) -> list[float]:
+    """The numbers that came with a frame, NaN where a sensor has none."""
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = None
+    if numbers is None or numbers.shape != shape:
+        wanted = f"{shape[0]} numbers" if shape else "a number"
+        raise ArgumentError(f"{name} must be {wanted}, not {value!r}")
+    return [float(number) for number in numbers.flat]
+
+
+def _tilt(psi: float, theta: float) -> MeasuredTilt:
+    if not all(abs(angle) < math.pi / 2.0 for angle in (psi, theta)):
+        raise InputError(
+            f"psi and theta must lie between -π/2 and π/2 radians, those of its attitude are {psi:g}, {theta:g}"
+        )
+    return MeasuredTilt((psi, theta))
 
 
 def _live_features(options: FeatureOptions) -> FeatureOptions:

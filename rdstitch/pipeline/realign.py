@@ -111,9 +111,9 @@ def left_out_images(rejected: Rejected) -> dict[int, str]:
 def _neighbours_of(rejected: Mapping[int, str], registration: Registration) -> dict[int, set[int]]:
     """The rejected that each other image was linked with."""
     linked: dict[int, set[int]] = {}
-    for fit in registration.alignment.links:
+    for fit in registration.alignment.holding:
         for image, other in (fit.images, fit.images[::-1]):
-            if fit.used and other in rejected and image not in rejected:
+            if other in rejected and image not in rejected:
                 linked.setdefault(image, set()).add(other)
     return linked
 

@@ -22,7 +22,8 @@ from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import OutputImage, StitchResult
-from rdstitch.system.outputs import Outputs, check_not_read, check_outputs, check_suffix, text_bytes
+from rdstitch.system.output_checks import check_not_read, check_outputs, check_suffix
+from rdstitch.system.outputs import Outputs, text_bytes
 from rdstitch.viewer.page import ViewedImage, viewer_page, viewer_path
 
 
@@ -168,7 +169,7 @@ def viewed_images(result: StitchResult) -> list[ViewedImage]:
     """The images of a result with what was found of each."""
     alignment, registration = result.registration.alignment, result.registration
     names = [source.name for source in registration.sources]
-    links_of = links_by_image(fit for fit in alignment.links if fit.used)
+    links_of = links_by_image(alignment.holding)
     viewed = []
     for outlines, index in zip(result.canvas.outlines, np.flatnonzero(alignment.used).tolist(), strict=True):
         source = registration.sources[index]

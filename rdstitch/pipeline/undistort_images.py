@@ -23,7 +23,8 @@ from rdstitch.options.option import check_parameter, files_in
 from rdstitch.pipeline.given_camera import read_camera
 from rdstitch.results.messages import Message, ignored
 from rdstitch.system.native_threads import one_native_thread
-from rdstitch.system.outputs import WRITABLE_SUFFIXES, Outputs, check_outputs, file_name
+from rdstitch.system.output_checks import WRITABLE_SUFFIXES, check_outputs
+from rdstitch.system.outputs import Outputs, file_name
 from rdstitch.system.progress import Progress, silent
 
 _POINTS_PER_SIDE = 256

@@ -58,11 +58,12 @@ def on_whole_pixels(registration: Registration) -> Registration:
 
 def _whole_shifts(registration: Registration) -> FloatArray | None:
     """Where the images that are used begin in the reference image, (N, 2); None unless whole pixels fit."""
-    alignment, support = registration.alignment, registration.alignment.support
+    alignment = registration.alignment
+    holding = {fit.images for fit in alignment.holding}
     number = np.cumsum(alignment.used) - 1
     pairs, shifts, spread, left = [], [], [], []
     for pair in registration.pairs:
-        if pair.images not in support:
+        if pair.images not in holding:
             continue
         link = pair.link()
         moved = link.points1 - link.points2

@@ -112,6 +112,8 @@ def summary(result: StitchResult | Registration) -> str:
     """λ and everything else of which there is one number, with the verdict."""
     registration = result.registration if isinstance(result, StitchResult) else result
     alignment, camera, reason = registration.alignment, registration.camera, registration.alignment.model_reason
+    used, compared = sum(fit.used for fit in alignment.links), len(registration.pairs)
+    of_copies = f"; {more} more are of copies" if (more := len(alignment.holding) - used) else ""
     known = {str(source.path) for source in registration.sources}
     unread = sum(message.images[0] not in known for message in registration.left_out)
     seen = isinstance(result, StitchResult) and result.seams.visible
@@ -125,7 +127,7 @@ def summary(result: StitchResult | Registration) -> str:
         ("λ (half diagonal)", registration.distortion_in_words(6)),
         ("λ per px²", f"{camera.distortion_px:.4e}"),
         ("images", f"{int(alignment.used.sum())} of {len(alignment.used) + unread}"),
-        ("pairs", f"{sum(fit.used for fit in alignment.links)} used of {len(registration.pairs)} compared"),
+        ("pairs", f"{used} used of {compared} compared{of_copies}"),
         ("error", f"{alignment.rms:.3f} pixels rms of all inliers"),
         ("motion", reason if reason.startswith(f"{alignment.model}:") else f"{alignment.model}: {reason}"),
         ("scene", alignment.relief.explanation),

@@ -54,7 +54,7 @@ def match_graph(registration: Registration) -> str:
         polyline((outline + shift) * scale, closed=True, stroke=BLUE, fill=BLUE, fill_opacity=0.05, stroke_opacity=0.5)
         for outline in outlines.values()
     ]
-    links = [fit for fit in alignment.links if fit.used]
+    links = alignment.holding
     by_error = sorted(links, key=lambda fit: fit.rms)
     for fit in (by_error[k] for k in evenly_spaced(len(links), _MAX_LINKS)):
         share = float(np.nan_to_num(np.clip(fit.rms / alignment.rms - 0.75, 0.0, 1.0)))

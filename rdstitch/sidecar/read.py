@@ -17,7 +17,8 @@ from rdstitch.export.georeference import Georeference, Residual
 from rdstitch.geometry.crs import Crs
 from rdstitch.sidecar.records import VERSION, ImageRecord, OutputRecord, ResidualRecord, SidecarRecord
 from rdstitch.system.file_access import read_text
-from rdstitch.system.outputs import Fingerprint, fingerprint, tiles_folder
+from rdstitch.system.output_checks import tiles_folder
+from rdstitch.system.outputs import Fingerprint, fingerprint
 from rdstitch.system.records import Matrix, convert, parse_json
 
 _OF_A_MACHINE = ("max_memory", "workers")  # options that the machine that wrote a sidecar had, not the picture

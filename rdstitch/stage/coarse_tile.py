@@ -55,11 +55,12 @@ def noise_variance(part: Image) -> float:
     """Variance of white noise in an image, by second differences, which content hardly has; half of them count."""
     rows = part[::2]
     second = rows[:, :-2] - 2.0 * rows[:, 1:-1] + rows[:, 2:]
-    return normal_std(second) ** 2 / 6.0
+    return normal_std(second) ** 2 / 6.0 if second.size else 0.0
 
 
 def energies(image: Image) -> tuple[float, float]:
     """Sums of the fourth powers of samples, and of the squares of their differences from neighbours."""
     squares = image * image
+    # By OpenCV, which takes a third of the time, and gives None for no pixels.
     slopes = cv2.subtract(image[1:], image[:-1]), cv2.subtract(image[:, 1:], image[:, :-1])
-    return float(np.vdot(squares, squares)), sum(float(np.vdot(slope, slope)) for slope in slopes)
+    return float(np.vdot(squares, squares)), sum(float(np.vdot(slope, slope)) for slope in slopes if slope is not None)

@@ -84,6 +84,8 @@ def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
         np.where(np.arange(n) < side, np.arange(n), np.arange(n) - n) for n, side in zip(shape, sizes[0], strict=True)
     )
     possible = _may_be_neighbours(y, x, sizes)
+    if not possible.any():  # in tiles of a few pixels
+        return np.zeros((0, 2)), np.zeros(0)
     deviation = normal_std(surface[possible]) + 1e-12
     found: dict[tuple[int, int], None] = {}
     # A pattern that repeats itself is as high in many places of the plain correlation, and in chance ones of the other.

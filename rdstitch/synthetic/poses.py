@@ -34,6 +34,8 @@ class Poses:
     tilt: FloatArray  # (N, 2): ψ and θ, radians
 
     def __post_init__(self) -> None:
+        if not all(np.isfinite(values).all() for values in vars(self).values()):
+            raise ArgumentError("poses must be finite")
         if not (self.height > 0.0).all():
             raise ArgumentError("the camera must stay above the plane")
 

@@ -44,6 +44,9 @@ class Photometry:
     def __post_init__(self) -> None:
         if self.bits not in (8, 16):
             raise ArgumentError(f"images have 8 or 16 bits, not {self.bits}")
+        least = np.concatenate([np.ravel(self.gain), [self.blur, self.noise]])
+        if not (np.isfinite([*least, self.vignetting, self.gamma]).all() and least.min() >= 0.0 and self.gamma > 0.0):
+            raise ArgumentError(f"light must be finite, and no gain, blur or noise below 0, nor gamma 0: {self}")
 
 
 @dataclass(frozen=True)

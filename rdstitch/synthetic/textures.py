@@ -92,6 +92,8 @@ def ground(size: tuple[int, int], seed: int, channels: int = 3) -> Texture:
     Dead leaves (polygons, ellipses and streaks with sizes distributed as r⁻³, later ones on top), the usual model for
     the statistics of natural images, under a 1/f grain. More than 16 megapixels are an :class:`EndlessTexture`.
     """
+    if min(size) < 1:
+        raise ArgumentError(f"ground has at least 1 x 1 texel, not {size[0]} x {size[1]}")
     if size[0] * size[1] > 16_000_000:
         return EndlessTexture(size, seed, channels)
     rng = np.random.default_rng(seed)

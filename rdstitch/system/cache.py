@@ -5,34 +5,27 @@ it, the sources of this package, and the versions of the packages that it comput
 whether or not a version number was raised; what is damaged is computed again.
 """
 
-import dataclasses
 import hashlib
-import io
 import os
-import pickle
 import tempfile
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from enum import Enum
 from functools import cache
 from pathlib import Path
 from threading import Lock
 from typing import Any, Generic, Self, TypeVar, cast
 
-import numpy as np
-
-from rdstitch.errors import ArgumentError, InputError, OutputError
+from rdstitch.errors import InputError, OutputError
 from rdstitch.system.file_access import is_url, open_regular, read_limited, remote_status
+from rdstitch.system.packing import digest, pack, unpack
 from rdstitch.system.temporary_folder import TemporaryFolder
 
 Value = TypeVar("Value")
 
 _FORMAT = 2
-_MAGIC = b"rdstitch pack 2\n"
-_HEAD = len(_MAGIC) + hashlib.sha256().digest_size
 _ABANDONED_SECONDS = 3600.0  # since a process last wrote into an unfinished entry; it was killed
 _MAX_ENTRY = 2**31  # bytes
 _CAPACITY = 16 * 2**20  # bytes of files whose content is kept in memory
@@ -40,10 +33,6 @@ _PACKAGE = Path(__file__).parents[1]
 _OPENCV = tuple(f"opencv-{kind}" for kind in ("contrib-python-headless", "contrib-python", "python-headless", "python"))
 _READERS = ("imagecodecs", "pillow", "pillow-heif", "rawpy", "simplejpeg", "tifffile")
 _PACKAGES = ("numpy", "scipy", *_OPENCV, *_READERS)
-_NUMPY = {"_reconstruct", "_frombuffer", "scalar", "ndarray", "dtype"}
-# What reading damaged bytes raises.
-_DAMAGED = (pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError, ImportError, EOFError)
-_ARRAY_KINDS = "biuf"
 
 
 @dataclass(frozen=True)
@@ -274,67 +263,3 @@ def _write_at_once(file: Path, data: bytes) -> None:
         with suppress(OSError):
             temporary.unlink()
         raise
-
-
-def pack(value: Any) -> bytes:
-    """A value as bytes: plain values, paths, arrays, and dataclasses and enumerations of rdstitch."""
-    body = pickle.dumps(value, protocol=5)
-    return _MAGIC + hashlib.sha256(body).digest() + body
-
-
-def unpack(data: bytes) -> Any:
-    """The value that :func:`pack` made bytes of; of other code they can name constructors of dataclasses alone."""
-    body = memoryview(data)[_HEAD:]
-    if data[:_HEAD] != _MAGIC + hashlib.sha256(body).digest():
-        raise InputError("damaged: it is not what was written")
-    try:
-        return _Unpickler(io.BytesIO(body)).load()
-    except _DAMAGED as error:
-        raise InputError(f"not what was expected: {error}") from error
-
-
-class _Unpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
-        known = module.split(".")[0] in ("rdstitch", "numpy", "pathlib")
-        named = super().find_class(module, name) if known else None
-        if isinstance(named, type) and (dataclasses.is_dataclass(named) or issubclass(named, (Path, Enum))):
-            return named
-        if module.split(".")[0] == "numpy" and name in _NUMPY:
-            return named
-        raise pickle.UnpicklingError(f"{module}.{name} is no result")
-
-
-def digest(value: Any) -> str:
-    """A short text that stands for a value: equal for equal values only."""
-    content = hashlib.sha256()
-    _add(content, value)
-    return content.hexdigest()
-
-
-def _add(content: Any, value: Any) -> None:
-    parts: list[Any] = []
-    if isinstance(value, np.generic):
-        value = value.item()
-    if value is None or isinstance(value, (bool, int, str, Path)):
-        text = str(value)
-    elif isinstance(value, float):
-        text = value.hex()
-    elif isinstance(value, np.ndarray) and value.dtype.kind in _ARRAY_KINDS:
-        # Sums depend on the order in memory in their last bits: it counts.
-        turned = value.flags.f_contiguous and not value.flags.c_contiguous
-        text = f"{value.dtype.str} {value.shape} {turned}"
-    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        parts = [getattr(value, item.name) for item in dataclasses.fields(value)]
-        text = type(value).__name__
-    elif isinstance(value, (tuple, list)):
-        parts, text = list(value), ""
-    elif isinstance(value, dict) and all(isinstance(key, str) for key in value):
-        parts, text = [part for item in sorted(value.items()) for part in item], ""
-    else:
-        raise ArgumentError(f"a {type(value).__name__} cannot stand in the name of a result")
-    data = text.encode("utf-8", "surrogatepass")
-    content.update(f"{type(value).__name__} {len(data)} {len(parts)} ".encode() + data)
-    if isinstance(value, np.ndarray):
-        content.update(np.ascontiguousarray(value.T if turned else value).data.cast("B") if value.size else b"")
-    for part in parts:
-        _add(content, part)

@@ -1,8 +1,7 @@
 """Whether keyframes agree with what is given of the camera: focal length, tilt, and the times of attitudes."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 
 from rdstitch.alignment.given_checks import LATE, judged_focal
 from rdstitch.alignment.sentences import attitudes_late, focal_contradicted
@@ -18,52 +17,49 @@ _INTERVAL = 24
 _SURER = 0.5  # of the standard deviation of all lengths that earlier frames were given with: they come again
 
 
-@dataclass(frozen=True)
-class CameraRevision:
-    """What a camera that is known better changes for the frames before."""
+def check_given_camera(keyframe_map: KeyframeMap, latest: Frame, report: Callable[[Message], None]) -> bool:
+    """Adopt what the keyframes show of a camera whose lens and focal length are given, where it is time to check it.
 
-    length_factor: float | None = None  # by which lengths change as all keyframes are placed again; None: none are
-    report_again: bool = False  # whether earlier frames are reported again, as their lengths are far surer
-    messages: Sequence[Message] = ()
-
-
-def revise_camera(keyframe_map: KeyframeMap, latest: Frame) -> CameraRevision:
-    """Keep what the keyframes show of a camera whose lens and focal length are given, where it is time to check it."""
+    True where earlier frames have other places by it, or lengths that are far surer: they come again.
+    """
     knowledge, has_plane = keyframe_map.knowledge, keyframe_map.has_plane
     if knowledge.focal is None or not knowledge.is_metric(latest.camera) or knowledge.model not in ("auto", "rigid"):
-        return CameraRevision()
+        return False
     if not keyframe_map.links or (has_plane and keyframe_map.added not in _CHECKS and keyframe_map.added % _INTERVAL):
-        return CameraRevision()
+        return False
     estimate, delay = _estimate(keyframe_map, knowledge.focal), knowledge.delay
-    messages = list[Message]()
     if latest.attitude is not None:
         knowledge.delay, knowledge.delay_std = estimate.delay, estimate.delay_std
         if abs(estimate.delay) > LATE * estimate.delay_std:
-            messages.append(attitudes_late(estimate.delay, estimate.delay_std))
+            report(attitudes_late(estimate.delay, estimate.delay_std))
     if knowledge.focal_contradicted:
         wrong = abs(estimate.log_focal) > estimate.log_focal_std
     else:
         knowledge.length_std, wrong = judged_focal(knowledge.stated_std, estimate.log_focal, estimate.log_focal_std)
+    scale = latest.camera.scale
     if wrong:  # the focal length that the images show, instead of the one that was given
-        scale, focal = latest.camera.scale, knowledge.focal * math.exp(estimate.log_focal)
+        focal = knowledge.focal * math.exp(estimate.log_focal)
         if not knowledge.focal_contradicted:
-            messages.append(focal_contradicted(knowledge.focal * scale, focal * scale, estimate.log_focal_std))
+            report(focal_contradicted(knowledge.focal * scale, focal * scale, estimate.log_focal_std))
         knowledge.focal, knowledge.length_std, knowledge.focal_contradicted = focal, estimate.log_focal_std, True
         knowledge.plane = MetricPlane(focal, estimate.tilt_by_itself, True, estimate.tilt_std)
-        return CameraRevision(math.exp(-estimate.log_focal), messages=messages)
-    if has_plane:
-        if knowledge.focal_contradicted:
-            return CameraRevision(messages=messages)
-        if abs(knowledge.delay - delay) > knowledge.delay_std:
-            return CameraRevision(1.0, messages=messages)
-        surer = knowledge.length_std < _SURER * knowledge.given_length_std
-        if surer:
-            knowledge.given_length_std = knowledge.length_std
-        return CameraRevision(report_again=surer, messages=messages)
-    shown = max(estimate.tilt_std, estimate.rms) * knowledge.focal * latest.camera.scale < MATCH_ERROR
-    if shown:
-        knowledge.plane = MetricPlane(knowledge.focal, estimate.tilt, True, estimate.tilt_std)
-    return CameraRevision(1.0 if shown else None, messages=messages)
+        keyframe_map.rescale(math.exp(-estimate.log_focal))
+        return True
+    if not has_plane:
+        shown = max(estimate.tilt_std, estimate.rms) * knowledge.focal * scale < MATCH_ERROR
+        if shown:
+            knowledge.plane = MetricPlane(knowledge.focal, estimate.tilt, True, estimate.tilt_std)
+            keyframe_map.rescale(1.0)
+        return shown
+    if knowledge.focal_contradicted:
+        return False
+    if abs(knowledge.delay - delay) > knowledge.delay_std:
+        keyframe_map.rescale(1.0)
+        return True
+    surer = knowledge.length_std < _SURER * knowledge.given_length_std
+    if surer:
+        knowledge.given_length_std = knowledge.length_std
+    return surer
 
 
 def _estimate(keyframe_map: KeyframeMap, focal: float) -> CameraEstimate:

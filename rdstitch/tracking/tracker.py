@@ -17,7 +17,7 @@ from rdstitch.inputs.odometry import BodyPose
 from rdstitch.matching.links import Link
 from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
-from rdstitch.tracking.camera_check import revise_camera
+from rdstitch.tracking.camera_check import check_given_camera
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.frame_links import agree
 from rdstitch.tracking.keyframe_map import KeyframeMap
@@ -35,8 +35,8 @@ class FrameTracker:
 
     Features (``detect``, in a frame's pixels; ``match``) are asked for only where the corners of the last keyframe,
     followed from frame to frame, do not place a frame. Keyframes are aligned by ``executor`` while further frames come;
-    where a tracker is ``patient`` these are waited for, so that the same frames give the same poses, else no frame
-    waits long. Where λ is known both options have it.
+    where a tracker is ``patient`` alignments are waited for, so that the same frames give the same poses, else no
+    frame waits long. Where λ is known both options have it.
     """
 
     def __init__(
@@ -189,16 +189,10 @@ class FrameTracker:
 
     def _with_checked_camera(self, latest: TrackedFrame) -> list[TrackingResult]:
         """Earlier frames whose places are others, or surer, by what keyframes show of a camera that was given."""
-        focal, revision = self._knowledge.focal, revise_camera(self._map, latest.frame)
-        for message in revision.messages:
-            self._report(message)
+        focal, changed = self._knowledge.focal, check_given_camera(self._map, latest.frame, self._report)
         if self._knowledge.focal != focal:
             self._refinement.drop()
-        if revision.length_factor is not None:
-            self._map.rescale(revision.length_factor)
-        elif not revision.report_again:
-            return []
-        return self._revised(self._map.revise(), latest)
+        return self._revised(self._map.revise(), latest) if changed else []
 
     def _take_over(self, latest: TrackedFrame | None, patience: float | None) -> list[TrackingResult]:
         return self._revised(self._refinement.take_over(self._map, patience), latest)
@@ -222,7 +216,8 @@ class FrameTracker:
             if self._map.has_plane:
                 reason = "it is not linked with the map yet"
         elif placed.aligned and pose is None:
-            reason = "the model has no metric poses"
+            metric = placed.placement.focal is not None
+            reason = "its place is not finite" if metric else "the model has no metric poses"
         return replace(
             self._unplaced(placed.frame, reason),
             placement=placed.placement if placed.aligned else None,

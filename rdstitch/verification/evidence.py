@@ -11,6 +11,7 @@ from rdstitch.choices import Purpose
 from rdstitch.matching.two_view import Pair
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import NO_CACHE, Cache
+from rdstitch.system.late_imports import special
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps
 
@@ -71,7 +72,10 @@ class ResultEvidence:
             return False
         overlaps = [link.agreement for link in self.checked if len({*images} & {*link.pair}) == len(images)]
         cells, confirming = sum(each.cells for each in overlaps), sum(each.confirming for each in overlaps)
-        return cells >= Limits.min_cells and confirming >= Limits.max_unlike_fraction * cells
+        if cells < Limits.min_cells or confirming < Limits.max_unlike_fraction * cells:
+            return False
+        # So many or more of independent cells.
+        return float(special.bdtrc(confirming - 1, cells, Limits.alike_by_chance)) < Limits.max_chance
 
     @cached_property
     def alike_fraction(self) -> float:

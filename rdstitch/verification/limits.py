@@ -17,7 +17,7 @@ class Limit:
 
 
 class Limits:
-    """Of matches, pixels, second motions and inputs; fractions of what their names say."""
+    """Of matches, pixels, patterns, second motions, layouts and inputs; fractions of what their names say."""
 
     # Matches.
     min_pair_inlier_fraction = Limit(0.5, "fraction", "by definition: less is another motion than that of the whole")
@@ -37,6 +37,8 @@ class Limits:
     min_cells = Limit(8, "cells", "unmeasured: of fewer the pixels say nothing")
     # Of the cells of one overlap, then of all overlaps.
     max_unlike_fraction = Limit(0.10, "fraction", "chance reaches 0.07; low sun, parallax, blur 0.20")
+    alike_by_chance = Limit(0.07, "fraction", "chance reaches 0.07")
+    max_chance = Limit(0.01, "probability that as many cells are alike by chance", "by definition")
     min_alike_fraction = Limit(0.25, "fraction", "0.26 to 1 in 22 sets that a person would keep: benchmarks.world")
     min_clearly_alike_fraction = Limit(0.5, "fraction", "python -m examples.benchmarks.relief")
     max_wrong_overlaps = Limit(0.1, "fraction", "25 taken at random, all right, show as much: Wilson's bound")

@@ -8,7 +8,7 @@ errors is a detail.
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
-from rdstitch.alignment.result import LinkFit, links_by_image
+from rdstitch.alignment.result import LinkFit, Unused, links_by_image
 from rdstitch.alignment.sentences import few_features
 from rdstitch.choices import Purpose
 from rdstitch.results.messages import Severity
@@ -29,12 +29,19 @@ def _disagreeing_pairs(evidence: ResultEvidence) -> Iterator[Finding]:
 
 
 def _misfitting_images(evidence: ResultEvidence) -> Iterator[Finding]:
-    """Images of whose matches too many do not fit into the whole, over all pairs that do."""
-    for k, links in sorted(links_by_image(evidence.used).items()):
+    """Images of whose matches too many do not fit into the whole, over all pairs that do.
+
+    A copy, which has no used pairs, is judged by its own.
+    """
+    of_copies = links_by_image(fit for fit in evidence.alignment.links if fit.reason is Unused.COPY)
+    links_of = of_copies | links_by_image(evidence.used)
+    for k, links in sorted((k, links) for k, links in links_of.items() if evidence.alignment.used[k]):
         fits = [fit for fit in links if fit.inliers >= Limits.min_pair_inlier_fraction * fit.count]
+        fits = fits or [fit for fit in links if not fit.used]
+        looked_at = (k,) if links[0].used else ()  # copies are not
         counts = _counts(fits)
         few = counts["inliers"] < Limits.min_image_inlier_fraction * counts["count"]
-        if few and not evidence.explained_by_depth((k,)):
+        if few and not evidence.explained_by_depth(looked_at):
             yield Finding(Kind.IMAGE_MISFITS, (k,), values={**counts, "reason": _reason(evidence, (k,), fits)})
 
 

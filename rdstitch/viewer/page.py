@@ -21,7 +21,7 @@ from PIL import Image
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.io.deepzoom import OVERLAP, TILE
-from rdstitch.system.outputs import tiles_folder
+from rdstitch.system.output_checks import tiles_folder
 
 _COLOUR = (0, 229, 255, 255)
 _CORNERS = 64  # of an outline, at most

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import BoolArray, FloatArray
 
 _FULL_CIRCLE = np.pi / 2  # images whose centres leave no wider gap than this, radians, count as all the way round
 
@@ -19,16 +19,21 @@ _STEEP = np.cos(np.radians(30.0))
 _VERTICAL = 1e-6  # radians from straight up or down at which an image shows no heading
 
 
-def levelled(matrices: FloatArray, reference: int, gravity: FloatArray | None = None) -> FloatArray:
+def levelled(
+    matrices: FloatArray, reference: int, gravity: FloatArray | None = None, counted: BoolArray | None = None
+) -> FloatArray:
     """Matrices (N, 3, 3) from undistorted coordinates of each image to directions in a level frame.
 
     The frame has x to the right, y down, and z towards the middle of what the images show, or towards the reference
     image where they show everything around. ``matrices`` are ``diag(f, f, 1) R_i``, from directions in any frame to the
-    images; gravity (N, 3) is down in the axes of each camera, NaN where it has not measured it.
+    images; gravity (N, 3) is down in the axes of each camera, NaN where it has not measured it. Images that are not
+    counted (N,) do not move the frame, into which they come; the reference is.
     """
     focal = float(np.linalg.norm(matrices[0, 0]))
     rotations = matrices / np.array([[focal], [focal], [1.0]])
-    frame = level_frame(rotations, reference, measured_down(rotations, gravity))
+    counted = np.ones(len(matrices), dtype=np.bool_) if counted is None else counted
+    down = measured_down(rotations[counted], None if gravity is None else gravity[counted])
+    frame = level_frame(rotations[counted], int(counted[:reference].sum()), down)
     directions: FloatArray = frame @ np.swapaxes(rotations, 1, 2) @ np.diag([1.0, 1.0, focal])
     return directions
 

@@ -4,7 +4,7 @@ Matches, cameras and homographies are those of upright images everywhere else. M
 images among others the distortion centre is mirrored too, which one lens of all cannot show.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -83,10 +83,13 @@ class QuarterTurns:
         relation = relation.reexpressed(turned, camera, camera2)
         return replace(link, points1=points1, points2=points2, relation=relation)
 
-    def alignment(self, alignment: Alignment, gravity: ArrayLike | None = None) -> Alignment:
+    def alignment(
+        self, alignment: Alignment, gravity: ArrayLike | None = None, near_copies: Collection[int] = ()
+    ) -> Alignment:
         """An alignment, in the frame of the reference as it is after its turn.
 
-        Gravity (N, 3) is down in the axes of the cameras before the turns; NaN where it is not known.
+        Gravity (N, 3) is down in the axes of the cameras before the turns; NaN where it is not known. Near copies do
+        not tell what is level.
         """
         if self.none:
             return alignment
@@ -97,7 +100,8 @@ class QuarterTurns:
             matrices /= np.linalg.norm(matrices[:, 2], axis=1)[:, None, None]  # diag(f, f, 1) R
             place = int(used[:reference].sum())
             down = None if gravity is None else self.directions(gravity)[used]
-            homographies[used] = levelled(matrices, place, down)
+            counted = ~np.isin(np.flatnonzero(used), list(near_copies))
+            homographies[used] = levelled(matrices, place, down, counted)
         else:
             plane = turn[reference]
             if poses is not None:

@@ -1,11 +1,12 @@
 """Turning on the spot: derivatives of the model, the level frame, a turn or a plane; the image whose frame it is."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from examples.worlds.alignment_scenes import aligned, scene
+from examples.worlds.alignment_scenes import aligned, scene, turn_links
 from examples.worlds.turns import camera_rotations, panorama_rotations
 from rdstitch.alignment import Alignment, align
 from rdstitch.alignment.frames.level_frame import level_frame, measured_down
@@ -15,32 +16,13 @@ from rdstitch.alignment.motion_models.rotation import ROTATION, rotation_from_ve
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import nearest_rotation
-from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
 
 LENS = Camera((640, 480), -0.2, focal=554.0, focal_source="guess")
 
 
-def _links(rotations: np.ndarray, rng: np.random.Generator, noise: float = 0.2, count: int = 120) -> list[Link]:
-    """Matches between all images that overlap, with their true homographies."""
-    focal = LENS.focal / LENS.scale
-    k = np.diag([focal, focal, 1.0])
-    links = []
-    for i in range(len(rotations)):
-        for j in range(i + 1, len(rotations)):
-            h = k @ rotations[j] @ rotations[i].T @ np.linalg.inv(k)
-            points = rng.uniform((0, 0), (639, 479), (count, 2))
-            flat = LENS.normalize(LENS.undistort(points))
-            moved = np.column_stack([flat, np.ones(count)]) @ h.T
-            moved[moved[:, 2] <= 0.05] = np.nan
-            seen = LENS.distort(LENS.denormalize(moved[:, :2] / moved[:, 2:]))
-            inside = ((seen >= 0) & (seen < (640, 480))).all(axis=1)
-            if inside.sum() < 20:
-                continue
-            noisy = [p[inside] + noise * rng.standard_normal((int(inside.sum()), 2)) for p in (points, seen)]
-            relation = RadialHomography(h, LENS, LENS, np.ones(len(noisy[0]), dtype=np.bool_), distortion_std=0.01)
-            links.append(Link(i, j, noisy[0], noisy[1], relation))
-    return links
+def _links(rotations: FloatArray, rng: np.random.Generator, **options: Any) -> list[Link]:
+    return turn_links(LENS, rotations, rng, **options)
 
 
 def test_rotations_are_found_in_scaled_and_negated_matrices() -> None:

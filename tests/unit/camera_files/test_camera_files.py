@@ -196,7 +196,7 @@ def test_a_strong_lens_of_others_takes_more_than_one_coefficient(tmp_path: Path,
 def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
     matrix = np.array([[700.0, 0, 320], [0, 703.0, 242], [0, 0, 1]])
     coefficients = np.array([[-0.25, 0.08, 0.0004, -0.0002, -0.01]])
-    for name in ("c.yml", "c.json"):
+    for name in ("c.yml", "c.json", "c.xml"):
         storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
         storage.write("calibration_time", "Sat Nov 21 2026")
         storage.write("image_width", 640)
@@ -204,8 +204,12 @@ def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
         storage.write("camera_matrix", matrix)
         storage.write("distortion_coefficients", coefficients)
         storage.release()
-    found, same = (read_camera_file(tmp_path / name) for name in ("c.yml", "c.json"))
-    assert found == same
+    rows = f"image_width: 640\nimage_height: 480\nK: {matrix.tolist()}\nD: {coefficients.tolist()}\n"
+    (tmp_path / "rows.yml").write_text(rows)
+    found, *same = (read_camera_file(tmp_path / name) for name in ("c.yml", "c.json", "rows.yml"))
+    assert same == [found, found]
+    with pytest.raises(InputError, match=r"c\.xml: is OpenCV's in XML, .* as YAML or JSON"):
+        load_camera(tmp_path / "c.xml")
     assert found.kind == "OpenCV"
     assert 0.0 < found.fit.rms < found.fit.largest < 4.0
     apart = _apart(_projected(matrix, coefficients[0], _rays(found.camera), fisheye=False), found.camera)
@@ -315,9 +319,13 @@ def test_cameras_of_colmap_and_kalibr_mean_what_opencv_says(tmp_path: Path, mode
         ("cam0:\n  camera_model: omni\n", "cam0.camera_model"),
         ("cam0:\n  camera_model: pinhole\n  distortion_model: fov\n", "cam0.distortion_model"),
         ("cam0:\n  camera_model: pinhole\ncam1:\n  camera_model: pinhole\n", "2 cameras"),
+        ("no camera at all\n", "file: is no camera file of a known format"),
+        ("[1, 2]\n", "file: is no camera file of a known format"),
+        ('{"a": 1}', "file: is no camera file of a known format"),
+        ("<html/>", "file: is XML, but no lens"),
     ],
 )
-def test_what_colmap_and_kalibr_know_and_rdstitch_does_not_is_named(tmp_path: Path, text: str, named: str) -> None:
+def test_what_others_know_and_rdstitch_does_not_is_named(tmp_path: Path, text: str, named: str) -> None:
     (tmp_path / "file").write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=named):
         load_camera(tmp_path / "file")

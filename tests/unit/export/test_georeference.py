@@ -280,6 +280,12 @@ def test_units_and_datum_of_proj_count() -> None:
     np.testing.assert_allclose(datum.geographic([[561_158.7783, 4_302_250.3225]]), right, atol=1e-7)
 
 
+@pytest.mark.parametrize("place", [(np.nan, 0.0), (0.0, np.nan), (100.0, 0.0)])
+def test_there_is_no_zone_of_nowhere(place: tuple[float, float]) -> None:
+    with pytest.raises(ArgumentError, match="no zone"):
+        Crs.nearest(*place)
+
+
 @pytest.mark.parametrize(
     ("latitude", "longitude", "epsg"),
     [

@@ -21,7 +21,7 @@ from PIL import ExifTags, Image
 from rdstitch.errors import ArgumentError, LimitError, OutputError
 from rdstitch.io import ImageSpec, Metadata, read_image, write_image, write_strips
 from rdstitch.io.formats import FORMATS
-from rdstitch.system.outputs import WRITABLE_SUFFIXES
+from rdstitch.system.output_checks import WRITABLE_SUFFIXES
 
 Pixels = NDArray[Any]
 

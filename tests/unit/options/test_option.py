@@ -73,6 +73,9 @@ def test_options_within_options_are_of_their_class() -> None:
     for name, given in (("features", "orb"), ("composite", {"scale": 2.0})):
         with pytest.raises(ArgumentError, match=rf"{name} must be \w+Options, not "):
             StitchOptions(**{name: given})  # type: ignore[arg-type]
+    for name in ("camera", "odometry"):
+        with pytest.raises(ArgumentError, match=f"{name} must be {name.title()} or a file, not 3"):
+            StitchOptions(**{name: 3})  # type: ignore[arg-type]
     with pytest.raises(ArgumentError, match="distortion must be"):
         TileOptions(distortion=3.0)
 

@@ -1,20 +1,24 @@
 """Layouts that are chosen by their seams, and what is said of those that break."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from examples.worlds.trust_sets import judge_set, trust_set
+from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 from rdstitch.compositing import CompositeOptions, SeamBreak, SeamQuality
 from rdstitch.io import write_image
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner
-from rdstitch.pipeline.choose_layout import _alternatives, _error, _Trials, choose_layout
+from rdstitch.pipeline.choose_layout import _alternatives, _differs, _error, _Trials, choose_layout
 from rdstitch.pipeline.compose import CanvasPlan
 from rdstitch.pipeline.lay_out import is_stretched
 from rdstitch.pipeline.realign import aligner_of, by_second_motions
@@ -23,7 +27,7 @@ from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.registration import Registration
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification.output_messages import seam_messages
-from tests.registrations import CAMERA, registered, source
+from tests.registrations import CAMERA, registered, registration, source
 
 
 def _of_two_surfaces(folder: Path) -> list[Path]:
@@ -138,3 +142,17 @@ def test_a_break_that_a_person_sees_is_one_warning_and_others_a_detail() -> None
     assert seam_messages(_quality(alike=0.49), paths) == []  # clouds drift, and the seams go around them
     assert (unlike.severity, unlike.code) == ("warning", "rival-motion")
     assert "only 49% of what the images share looks alike, the least between a.jpg and c.jpg" in unlike.text
+
+
+@pytest.mark.parametrize(("unseen", "differs"), [(0.02, False), (0.2, True)])
+def test_a_few_places_that_a_lens_cannot_see_are_no_other_layout(unseen: float, differs: bool) -> None:
+    given = registration(2, homographies=np.stack([np.eye(3)] * 2))
+
+    def transfer(i: int, j: int, points: FloatArray) -> FloatArray:
+        places = given.alignment.transfer(i, j, points)
+        inside = np.flatnonzero(((places >= 0.0) & (places < CAMERA.image_size)).all(axis=1))
+        places[inside[: math.ceil(unseen * len(inside))]] = np.nan
+        return places
+
+    other: Any = SimpleNamespace(used=given.alignment.used, transfer=transfer)
+    assert _differs(given, math.inf, other, stretched=False) is differs

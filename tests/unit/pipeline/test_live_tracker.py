@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import cv2
@@ -21,7 +22,7 @@ from examples.worlds.floor_drives import DISTORTION, floor_drive, true_path
 from examples.worlds.paths import drive_poses
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.arrays import FloatArray
-from rdstitch.errors import ImpossibleCameraError, InputError, LimitError
+from rdstitch.errors import ArgumentError, ImpossibleCameraError, InputError, LimitError
 from rdstitch.features import detect, match
 from rdstitch.features.prepared_image import View, prepare
 from rdstitch.geometry.camera import Camera
@@ -64,6 +65,16 @@ def test_what_cannot_be_read_is_a_pose_without_a_place(tmp_path: Path) -> None:
     pose = _tracker().add(tmp_path / "broken.png")
     assert "not an image in a supported format" in pose.reason
     assert not pose
+
+
+@pytest.mark.parametrize(
+    "measured", [{"timestamp": "x"}, {"attitude": (0.1, 0.2, 0.3)}, {"attitude": 0.1}, {"odometry": (1.0, 2.0)}]
+)
+def test_what_no_sensor_measures_is_refused_and_no_frame_is_counted(measured: dict[str, Any]) -> None:
+    tracker, image = _tracker(), np.zeros((240, 320), np.uint8)
+    with pytest.raises(ArgumentError, match=f"{next(iter(measured))} must be"):
+        tracker.add(image, **measured)
+    assert tracker.add(image).number == 0
 
 
 CAMERA = Camera((320, 240), DISTORTION, focal=256.0, focal_source="option")
@@ -130,7 +141,11 @@ def test_measured_attitudes_are_used(tmp_path: Path) -> None:
     images = sequence_over(partial(ground, seed=1), lens, swaying).frames()
     options = rdstitch.StitchOptions(camera=CAMERA, tilt=(0.0, 0.0), attitude_std=0.0)
     tracker = rdstitch.Tracker(options, rdstitch.FollowedPoses(HEIGHT))
-    found = [tracker.add(image, 0.1 * k, attitude=tilts[k]) for k, image in enumerate(images)]
+    for nothing in ((math.nan, 0.0), (0.0, math.nan), (3.0, -2.0)):  # the last in degrees
+        assert "psi and theta must lie between" in tracker.add(images[0], attitude=nothing).reason
+    found = [tracker.add(image, 0.1 * k, attitude=np.array(tilts[k])) for k, image in enumerate(images[:4])]
+    assert "psi and theta" in tracker.add(images[3], attitude=nothing, odometry=(math.nan, 0.0, 0.0)).reason
+    found += [tracker.add(image, 0.1 * k, attitude=tilts[k]) for k, image in enumerate(images[4:], 4)]
     times = "".join(f"{0.05 * k},0,0\n" for k in range(3))
     assert all(found[1:])
     steps = np.diff([(0.0, 0.0), *(pose.position[:2] for pose in found[1:])], axis=0)

@@ -102,6 +102,13 @@ SETS = {
     "two": [(0, 0, 420, 480), (280, 0, 700, 480)],
     "four": [(0, 0, 420, 300), (280, 3, 700, 300), (0, 170, 420, 480), (275, 170, 700, 480)],
 }
+# With a copy and a near copy, of the same image or of another one.
+NEAR = (4, 2, 424, 300)
+SETS |= {
+    "copies first": [SETS["four"][1], NEAR, *SETS["four"]],
+    "copies between": [*SETS["four"][:1], NEAR, SETS["four"][0], *SETS["four"][1:]],
+    "copies last": [*SETS["four"], NEAR, NEAR],
+}
 
 
 def _crops(name: str, noise: float = 0.0) -> list[NDArray[Any]]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import rdstitch
 from examples.worlds.stage_grid import StageGrid
-from rdstitch.errors import ArgumentError, InputError
+from rdstitch.errors import ArgumentError, InputError, RegistrationError
 
 STAGE = StageGrid(rows=2, columns=3, tile=256, overlap=0.2, content=0.9, backlash=2.0, seed=5)
 TILES = np.stack([STAGE.render(index) for index in range(6)])
@@ -49,6 +49,13 @@ def test_arrays_of_any_library_with_positions() -> None:
 def test_positions_that_are_no_numbers_of_each_tile_are_refused(places: object) -> None:
     with pytest.raises(ArgumentError, match="numbers, x and y of each of 6 tiles"):
         rdstitch.tiles(TILES, positions=places)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("side", [1, 2, 4])
+def test_tiles_of_a_few_pixels_are_refused_and_nothing_else_is_said(side: int) -> None:
+    with pytest.raises(RegistrationError, match="none of"):
+        rdstitch.place_tiles(TILES[:, :side, :side], positions=STAGE.nominal * side / 256)
 
 
 def test_a_list_of_positions_that_is_not_there_is_told_before_a_tile_is_read(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Ground truth: poses, relief, and rendered images."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -178,6 +179,23 @@ def test_all_that_images_see_lies_on_the_plane() -> None:
 def test_an_image_of_the_horizon_is_refused() -> None:
     with pytest.raises(ArgumentError, match="horizon"):
         fit_to_plane(LENS, Poses.of([(0.0, 0.0)], 260.0, 0.0, (1.3, 0.0)))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: grid_poses(LENS, 2, 2, overlap=np.nan),
+        lambda: Poses.of([(0.0, 0.0)], 260.0, np.inf),
+        lambda: Photometry(noise=-1.0),
+        lambda: Photometry(gain=np.array([1.0, np.nan])),
+        lambda: Photometry(gamma=0.0),
+        lambda: ground((0, 0), 1),
+    ],
+)
+def test_what_cannot_be_rendered_is_refused_by_what_it_is(make: Callable[[], object]) -> None:
+    with pytest.raises(ArgumentError, match=r"finite|texel"):
+        make()
 
 
 def test_motion_between_poses_is_the_homography_between_images() -> None:

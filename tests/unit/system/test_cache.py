@@ -21,7 +21,8 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.system import cache
-from rdstitch.system.cache import Cache, Stored, digest, pack, unpack
+from rdstitch.system.cache import Cache, Stored
+from rdstitch.system.packing import digest, pack, unpack
 from rdstitch.system.temporary_folder import TemporaryFolder
 
 

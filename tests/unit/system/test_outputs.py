@@ -24,7 +24,8 @@ from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
 from rdstitch.system.cache import Cache
 from rdstitch.system.file_access import content_state, is_url, url_of
-from rdstitch.system.outputs import Outputs, check_output, replace_folder, write_bytes_atomic
+from rdstitch.system.output_checks import check_output
+from rdstitch.system.outputs import Outputs, replace_folder, write_bytes_atomic
 from rdstitch.system.temporary_folder import TemporaryFolder
 from tests.faults import OPERATIONS, Operation, failing_disk
 

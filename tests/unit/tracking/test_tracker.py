@@ -21,8 +21,10 @@ from rdstitch.features.corner_flow import CornerFlow, corners_of, matched_corner
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
+from rdstitch.inputs.delays import DELAYS
 from rdstitch.inputs.keyframes import fitted_affine
 from rdstitch.inputs.odometry import BodyPose
+from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, blank, sequence_over
 from rdstitch.tracking import (
@@ -32,7 +34,7 @@ from rdstitch.tracking import (
     Preview,
     TrackingResult,
 )
-from rdstitch.tracking.camera_check import CameraRevision, revise_camera
+from rdstitch.tracking.camera_check import check_given_camera
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.map_refinement import MapRefinement
@@ -114,6 +116,15 @@ def _check(results: list[TrackingResult], sequence: Sequence) -> None:
 def test_the_path_and_lambda_come_near_thetrue_path(tracked: list[TrackingResult], drive: Sequence) -> None:
     _check(tracked, drive)
     assert abs(tracked[-1].distortion - DISTORTION) < 0.003
+
+
+def test_a_frame_whose_place_is_not_finite_is_told_so(drive: Sequence) -> None:
+    known = EstimationOptions(distortion=DISTORTION), AlignmentOptions(tilt=(0.0, 0.0), lens_known=True)
+    tracker = FrameTracker(*known, MADE_UP.__getitem__, partial(match, ratio=0.8), ThreadPoolExecutor(1))
+    camera = Camera(SIZE, DISTORTION, focal=256.0, focal_source="option")
+    attitudes = [np.full((len(DELAYS), 2), angle) for angle in (0.0, 0.0, np.nan)]
+    *_, last = [tracker.add(f, camera, a)[-1] for f, a in zip(_frames(drive), attitudes, strict=False)]
+    assert (last.pose, last.reason) == (None, "its place is not finite")
 
 
 def test_a_lambda_that_is_given_is_kept(drive: Sequence) -> None:
@@ -335,8 +346,11 @@ def test_keyframes_by_odometry_are_no_measurement_of_it() -> None:
 
 
 def test_keyframes_without_links_show_nothing_of_the_camera() -> None:
-    keyframe_map = KeyframeMap(_given_camera(), [_keyframe(23), _keyframe(24)], has_plane=True, added=24)
-    assert revise_camera(keyframe_map, keyframe_map.keyframes[-1].frame) == CameraRevision()
+    knowledge, messages = _given_camera(), list[Message]()
+    before = replace(knowledge)
+    keyframe_map = KeyframeMap(knowledge, [_keyframe(23), _keyframe(24)], has_plane=True, added=24)
+    assert not check_given_camera(keyframe_map, keyframe_map.keyframes[-1].frame, messages.append)
+    assert (knowledge, messages) == (before, [])
 
 
 def test_an_alignment_that_is_dropped_keeps_no_worker_busy() -> None:

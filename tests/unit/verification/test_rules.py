@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rdstitch.alignment.result import LinkFit
+from rdstitch.alignment.result import LinkFit, Unused
 from rdstitch.choices import Purpose
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
@@ -140,15 +140,26 @@ def test_poses_by_what_fills_less_than_half_of_the_images_are_none(
 
 
 @pytest.mark.parametrize(
-    ("purpose", "share", "placed"),
-    [(Purpose.MOSAIC, 0.15, True), (Purpose.MOSAIC, 0.05, False), (Purpose.TRAJECTORY, 0.15, False)],
+    ("purpose", "alike", "placed"),
+    [
+        (Purpose.MOSAIC, (15, 100), True),
+        (Purpose.MOSAIC, (5, 100), False),
+        (Purpose.TRAJECTORY, (15, 100), False),
+        # Of few cells as many are alike in 44, 15, 41 and 5 of 100 wrong places.
+        (Purpose.MOSAIC, (1, 8), False),
+        (Purpose.MOSAIC, (2, 10), False),
+        (Purpose.MOSAIC, (2, 20), False),
+        (Purpose.MOSAIC, (4, 20), False),
+        (Purpose.MOSAIC, (4, 8), True),
+    ],
 )
 def test_matches_of_a_picture_may_disagree_where_it_is_more_alike_than_by_chance(
-    purpose: Purpose, share: float, placed: bool
+    purpose: Purpose, alike: tuple[int, int], placed: bool
 ) -> None:
     """Depth, or what moved: seams go round it, or are told of; poses have nothing but their matches."""
     given = registration(2, links=(LinkFit(0, 1, 100, 40, 0.5, True),), keypoints=(900, 900))
-    link = replace(_checked(share, (0, 1), unique=False), agreement=Agreement(100, round(100 * share), 100, 0.6))
+    confirming, cells = alike
+    link = replace(_checked(0.0, (0, 1), unique=False), agreement=Agreement(cells, confirming, cells, 0.6))
     found = evidence(given, purpose, checked=[link])
     assert bool(failures_of_matches(found)) is not placed
 
@@ -182,6 +193,13 @@ def test_images_of_whose_matches_two_fifths_disagree_are_named() -> None:
     assert "b.jpg has less than a third of the features that others have (blurred?)" in second.text
     assert second.images == ("folder/b.jpg",)
     assert _misfits(100, agree=0.65) == []
+
+
+@pytest.mark.parametrize("inliers", [20, 55, 65])
+def test_a_copy_is_judged_by_its_own_matches(inliers: int) -> None:
+    links = LinkFit(0, 1, 100, 90, 0.5, True), LinkFit(0, 2, 100, inliers, 0.5, False, Unused.COPY)
+    found = [*rules._misfitting_images(evidence(registration(3, links=links, keypoints=(900,) * 3)))]
+    assert [finding.images for finding in found] == [(2,)] * (inliers < 60)
 
 
 def _texts(*sources: Source) -> list[str]:
