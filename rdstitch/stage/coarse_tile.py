@@ -61,5 +61,6 @@ def noise_variance(part: Image) -> float:
 def energies(image: Image) -> tuple[float, float]:
     """Sums of the fourth powers of samples, and of the squares of their differences from neighbours."""
     squares = image * image
-    slopes = image[1:] - image[:-1], image[:, 1:] - image[:, :-1]
-    return float(np.vdot(squares, squares)), sum(float(np.vdot(slope, slope)) for slope in slopes)
+    # By OpenCV, which takes a third of the time, and gives None for no pixels.
+    slopes = cv2.subtract(image[1:], image[:-1]), cv2.subtract(image[:, 1:], image[:, :-1])
+    return float(np.vdot(squares, squares)), sum(float(np.vdot(slope, slope)) for slope in slopes if slope is not None)
