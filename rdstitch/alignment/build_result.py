@@ -14,7 +14,7 @@ from rdstitch.alignment.least_squares.link_equations import squared_lengths, whi
 from rdstitch.alignment.lens.lens_description import radius_std
 from rdstitch.alignment.lens.lens_selection import CENTER, ENOUGH_IMAGES, LensChoice
 from rdstitch.alignment.near_copies import with_near_copies
-from rdstitch.alignment.noise import coherence
+from rdstitch.alignment.noise import coherence, shows_relief
 from rdstitch.alignment.result import Alignment, LinkFit, PlanarPoses, ReliefTest, Unused
 from rdstitch.alignment.select import ModelChoice
 from rdstitch.alignment.sentences import (
@@ -22,7 +22,7 @@ from rdstitch.alignment.sentences import (
     focal_overruled,
     lens_not_observable,
     not_converged,
-    relief_test,
+    relief_explained,
 )
 from rdstitch.alignment.uncertainty import considered_covariance, lever_std, pose_covariances
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
@@ -113,7 +113,9 @@ class AdjustedImages:
     def relief(self) -> ReliefTest:
         """Whether the scene is the plane that it is taken for."""
         seen = self.problem.observations
-        return relief_test(coherence(seen, self.errors, seen.inliers(self.squared)), self.fit.model, len(seen))
+        left = coherence(seen, self.errors, seen.inliers(self.squared))
+        explanation = relief_explained(left, self.fit.model, len(seen))
+        return ReliefTest(shows_relief(left), left.correlation, left.size, explanation)
 
     def of_all(self, values: FloatArray) -> FloatArray:
         """Values of the images aligned (N, ...) as those of all images, NaN for the rest."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from rdstitch.alignment.motion_models import MotionModel
 from rdstitch.alignment.noise import COHERENT_CORRELATION, Coherence, shows_relief
-from rdstitch.alignment.result import Alignment, ReliefTest, Unused
+from rdstitch.alignment.result import Alignment, Unused
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 from rdstitch.results.messages import Message, left_out, names_of
@@ -58,22 +58,20 @@ def attitudes_contradicted(scatter: float, change: FloatArray | None, scatter_ch
     return Message(text, code="attitudes-contradicted")
 
 
-def relief_test(left: Coherence, model: MotionModel, links: int) -> ReliefTest:
+def relief_explained(left: Coherence, model: MotionModel, links: int) -> str:
     """What the agreement of neighbours that a model leaves means for the scene."""
     found = shows_relief(left)
     agreement = f"errors of neighbours agree (correlation {left.correlation:.2f}, {left.size:.1f} pixels in common)"
     if model.on_sphere:
         moved = "the camera moved between the images (parallax): what is near does not fit; turn about the lens"
-        text = f"{agreement}: {moved}" if found else f"the camera hardly moved (correlation {left.correlation:.2f})"
-    elif found:
+        return f"{agreement}: {moved}" if found else f"the camera hardly moved (correlation {left.correlation:.2f})"
+    if found:
         wrong = f"the scene is not one plane, or the {model.name} model does not describe the camera; λ may be off"
-        text = f"{agreement}: {wrong}"
-    elif left.correlation > COHERENT_CORRELATION:
-        text = f"{agreement}, as over a scene that is nearly flat"
-    else:
-        seen = "the scene is flat" if links > 1 else "no relief shows, but hills as wide as one overlap would not"
-        text = f"errors of neighbours hardly agree (correlation {left.correlation:.2f}): {seen}"
-    return ReliefTest(found, left.correlation, left.size, text)
+        return f"{agreement}: {wrong}"
+    if left.correlation > COHERENT_CORRELATION:
+        return f"{agreement}, as over a scene that is nearly flat"
+    seen = "the scene is flat" if links > 1 else "no relief shows, but hills as wide as one overlap would not"
+    return f"errors of neighbours hardly agree (correlation {left.correlation:.2f}): {seen}"
 
 
 def lens_not_observable(purpose: Purpose, *, depth: bool) -> Message:

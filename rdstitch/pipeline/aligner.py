@@ -1,7 +1,7 @@
 """Stages: registered pairs become one alignment, which finds more pairs, which make a better alignment."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Self
@@ -11,6 +11,7 @@ import numpy as np
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
 from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
+from rdstitch.alignment.least_squares.plane_marks import Sighting
 from rdstitch.alignment.near_copies import without_measurements
 from rdstitch.alignment.result import LinkFit, Unused
 from rdstitch.choices import Purpose
@@ -151,9 +152,7 @@ class Aligner:
         if not related:  # all images show the same
             copies = {}
             related = distinct(pairs, copies)
-        if (reference := self.options.reference) is not None:
-            reference = copies.get(reference, reference)
-        options = replace(self.options, reference=reference)
+        options = self._options_without(copies)
         near = without_measurements(near_copies_of(related), options)
         evidence = [ends for ends in related if not near.keys() & {*ends}]
         if not evidence:
@@ -180,6 +179,17 @@ class Aligner:
             complete("draft", lambda: task.draft),
             completed=lambda: complete("alignment", lambda: task.result),
         )
+
+    def _options_without(self, copies: Mapping[int, int]) -> AlignmentOptions:
+        """The options, the reference and control points being shown by what images are copies of."""
+        reference, control = self.options.reference, list[Sighting]()
+        for one in self.options.control:
+            first = copies.get(one.image, one.image)
+            upright = self._quarters.point(np.array(one.offset), one.image)
+            x, y = self._quarters.back.point(upright, first).tolist()
+            control.append(replace(one, image=first, offset=(x, y)))
+        reference = None if reference is None else copies.get(reference, reference)
+        return replace(self.options, reference=reference, control=tuple(control))
 
     def _links_of_copies(self, alignment: Alignment, pairs: Sequence[PairRegistration]) -> Iterator[LinkFit]:
         """How well the registered pairs agree that are no evidence."""

@@ -1,0 +1,53 @@
+"""What is aligned of images that are there twice, and what is given of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from examples.worlds.alignment_scenes import grid_scene
+from rdstitch.alignment import AlignmentOptions
+from rdstitch.alignment.frames.quarter_turns import QuarterTurns
+from rdstitch.alignment.least_squares.plane_marks import Sighting
+from rdstitch.features import Correspondences
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.radial_homography import to_plane
+from rdstitch.matching.feature_store import StoredMatches
+from rdstitch.matching.links import Link
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.pipeline.aligner import Aligner
+from rdstitch.system.cache import NO_CACHE
+
+COPY = 12
+
+
+def _registered(link: Link) -> PairRegistration:
+    index = np.column_stack([np.arange(len(link))] * 2)
+    matches = Correspondences(index, link.points1, link.points2, np.linspace(0.1, 0.8, len(link)))
+    return PairRegistration(link.image1, link.image2, StoredMatches.of(matches), link.relation)
+
+
+@pytest.mark.parametrize(("moved", "orientation"), [(0.0, 1), (0.0, 6), (3.0, 1)])
+def test_a_control_point_in_a_copy_counts(moved: float, orientation: int) -> None:
+    """Where that is saved as a camera on its side does, too; and in one that was taken again beside its image."""
+    given = grid_scene(4, 3, seed=1, per_link=60, outliers=0.0)
+    lens, quarters = Camera((640, 480), distortion=given.distortion), QuarterTurns((1,) * 12 + (orientation,))
+    first = next(link for link in given.links if link.image1 == 0)
+    step = np.array([moved, 0.0])
+    relation = replace(first.relation, homography=np.eye(3))
+    again = replace(first, image2=COPY, points2=first.points1 + step, relation=relation)
+    control = []
+    for number, image in enumerate((0, 3, 5, 8, 11)):
+        offset = np.array([30.0, 50.0])
+        x, y = to_plane(lens, np.linalg.inv(given.truth[image]), offset[None] + lens.center)[0].tolist()
+        shown = COPY if image == 0 else image
+        seen = offset + step if image == 0 else offset
+        across, down = quarters.back.point(seen, shown).tolist()
+        control.append(Sighting(shown, (across, down), f"P{number}", (100.0 * x, -100.0 * y), 0.01))
+    options = AlignmentOptions(model="rigid", lens="division", control=tuple(control))
+    cameras = (*given.cameras, given.cameras[0])
+    aligner = Aligner(tuple(map(str, range(13))), cameras, options, NO_CACHE, 3.0, quarters=quarters)
+    found = aligner.align([_registered(link) for link in (*given.links, again)]).alignment
+    assert found.used.all()
+    assert found.leverage.keys() == {one.name for one in control}
+    assert found.leverage["P0"] > 0.05
