@@ -12,7 +12,7 @@ from rdstitch.geometry.camera import border_of
 from rdstitch.geometry.radial_homography import transfer
 from rdstitch.matching.two_view import Pair, PairRegistration
 
-_SAME_PX = 0.5
+SAME_PX = 0.5
 """Pixels that matches of a copy move by at most: saving again moves them by less, and no place is off by more."""
 
 _MIN_SAME = 0.9  # share of the matches that do: of an image that shows something else beside what is static, more move
@@ -23,7 +23,7 @@ def copies_of(pairs: Sequence[PairRegistration]) -> dict[int, int]:
     """Of each image that is a copy, by its index, the first image that it is a copy of."""
     result: dict[int, int] = {}
     for pair in sorted(pairs, key=lambda pair: pair.images):
-        if not {*pair.images} & result.keys() and _moves_within(pair, np.full(2, _SAME_PX)):
+        if not {*pair.images} & result.keys() and _moves_within(pair, np.full(2, SAME_PX)):
             result[pair.image2] = pair.image1
     return result
 

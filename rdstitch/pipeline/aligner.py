@@ -14,12 +14,13 @@ from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.alignment.least_squares.plane_marks import Sighting
 from rdstitch.alignment.near_copies import without_measurements
 from rdstitch.alignment.result import LinkFit, Unused
+from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 from rdstitch.errors import ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import loop_closures
-from rdstitch.matching.copies import copies_of, distinct, near_copies_of
+from rdstitch.matching.copies import SAME_PX, copies_of, distinct, near_copies_of
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
@@ -41,6 +42,9 @@ _EXPLAINED = 0.5
 _WIDTH_PER_SIGMA, _MIN_THRESHOLD = 4.0, 0.5
 # Share of its inliers that a pair must keep; otherwise the alignment does not fit it, and it stays as it is.
 _MIN_KEPT = 0.5
+# Times the errors of its own pairs that a near copy is off by where it needs a motion that the others do not: 20 to 60
+# of rendered ones that are tilted or zoomed, 1.0 of those that are only shifted.
+_MISFIT = 1.5
 
 
 @contextmanager
@@ -144,7 +148,8 @@ class Aligner:
         every = np.concatenate(errors)
         return alignment.on_sphere or not len(every) or bool(np.mean(every < self.threshold) > _EXPLAINED)
 
-    def _drafted(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
+    def _drafted(self, pairs: Sequence[PairRegistration], others: frozenset[int] = frozenset()) -> AlignedPairs:
+        """The images aligned, near copies among them placed afterwards; but ``others`` are aligned as all are."""
         if not any(pair.relation for pair in pairs):
             raise RegistrationError(_no_overlap(self.paths, pairs))
         copies = copies_of(pairs)
@@ -154,6 +159,7 @@ class Aligner:
             related = distinct(pairs, copies)
         options = self._options_without(copies)
         near = without_measurements(near_copies_of(related), options)
+        near = {copy: first for copy, first in near.items() if copy not in others}
         evidence = [ends for ends in related if not near.keys() & {*ends}]
         if not evidence:
             near, evidence = {}, [*related]
@@ -174,14 +180,26 @@ class Aligner:
             alignment = replace(alignment, links=(*alignment.links, *self._links_of_copies(alignment, pairs)))
             return alignment.with_messages([self._counted_once(twice)] if twice else [])
 
-        return AlignedPairs(
-            tuple(pairs),
-            complete("draft", lambda: task.draft),
-            completed=lambda: complete("alignment", lambda: task.result),
-        )
+        draft = complete("draft", lambda: task.draft)
+        if misfits := self._misfits(draft, pairs, near):
+            return self._drafted(pairs, others | misfits)
+        return AlignedPairs(tuple(pairs), draft, completed=lambda: complete("alignment", lambda: task.result))
+
+    def _misfits(
+        self, alignment: Alignment, pairs: Sequence[PairRegistration], near: Mapping[int, int]
+    ) -> frozenset[int]:
+        """The near copies whose pairs fit worse to a model that others chose: these show what it lacks."""
+        errors: dict[int, list[FloatArray]] = {}
+        for pair in pairs:
+            among = [*(near.keys() & {*pair.images})]
+            if len(among) == 1 and pair.relation and alignment.used[[*pair.images]].all():
+                both = pair.errors(alignment.transfer), pair.own_errors
+                errors.setdefault(among[0], []).append(np.array(both)[:, pair.relation.inliers])
+        medians = {copy: np.median(np.concatenate(parts, axis=1), axis=1) for copy, parts in errors.items()}
+        return frozenset(k for k, (by_all, own) in medians.items() if by_all > max(_MISFIT * own, SAME_PX / 2.0))
 
     def _options_without(self, copies: Mapping[int, int]) -> AlignmentOptions:
-        """The options, the reference and control points being shown by what images are copies of."""
+        """The options, where the reference, control points and positions are those of what images are copies of."""
         reference, control = self.options.reference, list[Sighting]()
         for one in self.options.control:
             first = copies.get(one.image, one.image)
@@ -189,7 +207,15 @@ class Aligner:
             x, y = self._quarters.back.point(upright, first).tolist()
             control.append(replace(one, image=first, offset=(x, y)))
         reference = None if reference is None else copies.get(reference, reference)
-        return replace(self.options, reference=reference, control=tuple(control))
+        positions, deviations = self.options.positions, self.options.positions_std
+        if positions is not None:
+            positions, deviations = np.array(positions, dtype=np.float64), np.array(deviations, dtype=np.float64)
+            for copy, first in copies.items():
+                if np.isnan(positions[first]).any():
+                    positions[first], deviations[first] = positions[copy], deviations[copy]
+        return replace(
+            self.options, reference=reference, control=tuple(control), positions=positions, positions_std=deviations
+        )
 
     def _links_of_copies(self, alignment: Alignment, pairs: Sequence[PairRegistration]) -> Iterator[LinkFit]:
         """How well the registered pairs agree that are no evidence."""
@@ -197,7 +223,7 @@ class Aligner:
         for pair in pairs:
             if pair.relation and pair.images not in known:
                 errors = pair.errors(alignment.transfer)[pair.relation.inliers]
-                good = errors[errors < self.threshold]
+                good = errors[errors < max(self.threshold, SAME_PX)]
                 rms = float(np.sqrt(np.mean(good**2))) if len(good) else math.nan
                 yield LinkFit(*pair.images, len(errors), len(good), rms, used=False, reason=Unused.COPY)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.matching.match_graph import spanning_tree
+from rdstitch.matching.match_graph import spanning_forest, spanning_tree
 from rdstitch.results.registration import Registration
 from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 from rdstitch.robust.posterior import Evidence
@@ -80,10 +80,13 @@ def _whole_shifts(registration: Registration) -> FloatArray | None:
     if not pairs or max(spread) > _RESOLVED:
         return None
     first, second = np.array(pairs, dtype=np.intp).T
+    count, weight = int(alignment.used.sum()), np.ones(len(first))
+    if len(spanning_forest(count, first, second, weight)) < count - 1:  # an image is held by none of them
+        return None
     motions = np.tile(np.eye(3), (len(first), 1, 1))
     motions[:, :2, 2] = shifts
     root = int(number[alignment.reference])
-    tree = spanning_tree(int(alignment.used.sum()), first, second, np.ones(len(first)), root)
+    tree = spanning_tree(count, first, second, weight, root)
     places = np.rint(tree.chained(motions, first, np.eye(3))[:, :2, 2])
     if (places[second] - places[first] != shifts).any():
         return None

@@ -51,3 +51,14 @@ def test_a_control_point_in_a_copy_counts(moved: float, orientation: int) -> Non
     assert found.used.all()
     assert found.leverage.keys() == {one.name for one in control}
     assert found.leverage["P0"] > 0.05
+
+
+def test_a_position_that_a_copy_alone_has_is_that_of_its_image() -> None:
+    positions, deviations = np.full((2, 2), np.nan), np.full(2, np.nan)
+    positions[1], deviations[1] = (3.0, 4.0), 2.0
+    options = AlignmentOptions(positions=positions, positions_std=deviations)
+    aligner = Aligner(("a", "b"), (Camera((640, 480)),) * 2, options, NO_CACHE, 3.0)
+    found = aligner._options_without({1: 0})
+    np.testing.assert_array_equal(found.positions, [[3.0, 4.0]] * 2)
+    np.testing.assert_array_equal(found.positions_std, [2.0, 2.0])
+    assert np.isnan(positions[0]).all()
