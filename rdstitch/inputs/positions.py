@@ -178,7 +178,7 @@ def geographic_places(system: NamedSystem, places: FloatArray, file: str) -> lis
 def _degrees(row: Row, column: str, reference: str) -> float | None:
     """Degrees, or degrees, minutes and seconds, of this or the other side (N, S, E, W); None where there are none."""
     if not (parts := row.numbers_within(column)):
-        return None
+        return row.number(column)
     text = row.values[column]
     value = sum(abs(part) / 60.0**k for k, part in enumerate(parts[:3]))
     words = re.findall(r"[^\W\d_]+", NUMERAL.sub(" ", text).lower())

@@ -34,13 +34,14 @@ IMAGE_NAMES, TIME_NAMES = "name filename file image imagename", "timestamp time 
 
 _DELIMITERS = ",;\t"
 _HEADING = re.compile(r"(?:.*:)?([^\[(]*)(?:[\[(]([^\])]*)[\])]?.*)?", re.DOTALL)
-_EMPTY = ("", "-", "nan")
+_EMPTY = ("", "-", "nan", "n/a", "na", "none", "null")
 # A number by its decimal mark; the other mark may stand between groups of three digits.
 _NOTATIONS = {
     mark: re.compile(rf"(?=[-+]?[.,]?\d)[-+]?(\d+|[1-9]\d{{0,2}}(\{other}\d{{3}})+)?(\{mark}\d*)?([eE][-+]?\d+)?")
     for mark, other in (".,", ",.")
 }
 _GROUPED = re.compile(r"(?<=\d)[\s'’](?=\d{3}(?!\d))")
+_BEHIND_A_NAME = re.compile(r"\.[A-Za-z]\w+\s(?!.*\.[A-Za-z]\w+$)")  # words that follow a file's ending
 NUMERAL = re.compile(r"[-+\u2212]?[.,]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+)?")
 
 
@@ -154,12 +155,14 @@ def numbered_lines(text: str, file: str) -> list[tuple[str, str]]:
 
 
 def listed_rows(text: str, file: str, columns: Sequence[str]) -> list[Row]:
-    """Lines of a name, which may hold blanks, and numbers between blanks; see :func:`numbered_lines`."""
+    """Lines of a name, which may hold blanks, and two numbers or more; see :func:`numbered_lines`."""
     rows = []
     for where, line in numbered_lines(text, file):
         fields = line.split()
-        count = len(list(takewhile(_readings, reversed(fields[1:]))))
+        count = len(list(takewhile(lambda field: _readings(field) or field.lower() in _EMPTY, reversed(fields[1:]))))
         name = line.rsplit(maxsplit=count)[0]
+        if count < 2 or _BEHIND_A_NAME.search(name):
+            raise InputError(f"{where}: expected a name and numbers between blanks, not '{line}'")
         rows.append((where, zip(columns, (name, *fields[len(fields) - count :]), strict=False)))
     return _rows(rows)
 

@@ -165,6 +165,10 @@ def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> N
         ),
         ("name,lat,lon\na.jpg,33.85 S,5 O\n", "line 2: expected a longitude like"),
         ("name,lat,lon\na.jpg,48,8582,2,2945\n", "line 2: has 5 fields"),
+        ("name,lat,lon\na.jpg,1,2\nb.jpg,oops,2\n", "line 3: expected a number for latitude, not 'oops'"),
+        ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg oops 5e6\n", "line 3: expected a name and numbers between blanks, not 'b"),
+        ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 500000m 5e6 100 0\n", "line 3: expected a name and numbers between blanks"),
+        ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 5e5 oops 100\n", "line 3: expected a name and numbers between blanks"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, message: str) -> None:
