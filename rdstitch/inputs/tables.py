@@ -106,8 +106,9 @@ def csv_rows(
 ) -> list[Row]:
     """The rows of a CSV file with a heading; ``wanted`` are the columns that there must be, and alternatives to them.
 
-    Of each column ``columns`` has all headings that mean it, between blanks. Others are ignored; of several with one
-    meaning the last counts that is not empty. ``file`` is what messages call it.
+    They are named by headings, as messages name them. Of each column ``columns`` has all headings that mean it, between
+    blanks. Others are ignored; of several with one meaning the last counts that is not empty. ``file`` is what messages
+    call it.
     """
     if "\0" in text:
         raise InputError(f"{file}: is not UTF-8 text; save it as CSV in UTF-8")
@@ -122,7 +123,7 @@ def csv_rows(
     try:
         headings = next(reader, [])
         meanings = [known(heading) for heading in headings]
-        if not any(set(names.split(",")) <= set(meanings) for names in wanted):
+        if not any({known(name) or name for name in names.split(",")} <= set(meanings) for names in wanted):
             raise InputError(f"{file}: its first line names no columns like {' or '.join(wanted)}")
         rows = []
         for fields in reader:
@@ -134,6 +135,13 @@ def csv_rows(
     except csv.Error as error:
         raise InputError(f"{file}: line {reader.line_num + start}: is not CSV: {error}") from error
     return _rows(rows)
+
+
+def heading_of(text: str, file: str, columns: Mapping[str, str], units: Sequence[str] = ()) -> tuple[str, int]:
+    """The line that :func:`csv_rows` takes for the heading, and how many columns that are known it names."""
+    known = _finder(file, columns, units)
+    line = next((line for line in text.splitlines() if _is_heading(line, known)), "")
+    return line, sum(known(field) is not None for field in re.split(f"[{_DELIMITERS}]", line.lstrip("# ")))
 
 
 def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> list[Row]:

@@ -76,6 +76,7 @@ def _read(folder: Path, text: str, epsg: int | None = None, offset: float = 0.0)
         "a.jpg,North,48.8582222222,West,2.2945,35.5\nb.jpg,S,48.8582222222,E,2.2945,\n",
         "# Name;Lat [deg];Lon [deg];Alt (m)\n"
         "C:\\flight\\a.jpg;48,8582222222;-2,2945;35,5\nb.jpg;-48,8582222222;2,2945\n",
+        "EPSG:4326\nname,x,y,z\na.jpg,-2.2945,48.8582222222,35.5\nb.jpg,2.2945,-48.8582222222,\n",
         "EPSG:4326\na.jpg -2.2945 48.8582222222 35.5 0 0 0\n\nb.jpg 2.2945 -48.8582222222\n",
         "\n# of flight 3\nEPSG:4326\na.jpg -2.2945 48.8582222222 35.5\nb.jpg 2.2945 -48.8582222222\n",
     ],
@@ -214,6 +215,9 @@ def test_projected_numbers_in_other_notations_and_zero_longitude(tmp_path: Path)
         ("1 2 3 4 5 a.jpg", "line 1: expected a coordinate system"),
         ("EPSG:4326\n1 2 3 4 a.jpg", "line 2: expected X Y Z PX PY IMAGE"),
         ("\n# surveyed\nEPSG:4326\n1 2 3 4 a.jpg", "line 4: expected X Y Z PX PY IMAGE"),
+        ("EPSG:4326\n# Bob, 2024\n1 2 3 4 a.jpg", "line 3: expected X Y Z PX PY IMAGE"),
+        ("EPSG:4326\n# Bob 2024\nx,y,px,py,image\n1,2,x,4,a.jpg", "line 4: expected a number for px, not 'x'"),
+        ("EPSG:4326\nx,y,px,py,name\n1,2,3,4,a.jpg", "names no columns like x,y,px,py,image or longitude"),
         ("EPSG:4326\n1 2 3 640 5 a.jpg", "line 2: is not within the 640 x 480 pixels of a.jpg"),
         ("EPSG:4326\n1 2 3 nan 5 a.jpg", "line 2: has no number for px"),
         ("EPSG:4326\n1 2 3 4 5 z.jpg", "has no ground control point in any of the images"),
