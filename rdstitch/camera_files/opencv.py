@@ -76,9 +76,15 @@ def read_opencv(content: dict[str, Any], file: str, image_size: ImageSize | None
     """
     named = {_ALIASES.get(name, name): value for name, value in content.items()}
     for name, rows in (("camera_matrix", 3), ("distortion_coefficients", 1)):
-        if isinstance(given := named.get(name), list):  # as ``ros2 topic echo`` prints them; or row by row
-            values = [value for row in given for value in (row if isinstance(row, list) else [row])]
-            named[name] = {"rows": rows, "cols": len(values) // rows, "data": values}
+        given = named.get(name)
+        shape = given if isinstance(given, dict) else {}
+        if isinstance(data := shape.get("data", given), list):  # as ``ros2 topic echo`` prints them; or row by row
+            values = [value for row in data for value in (row if isinstance(row, list) else [row])]
+            named[name] = {"rows": rows, "cols": len(values) // rows, **shape, "data": values}
+        elif name in named and not shape:
+            raise ArgumentError(f"{name}: expected rows, cols and data, or a list of numbers")
+    if named.get("distortion_model") == "":
+        raise ArgumentError("distortion_model: is empty, as of a camera that is not calibrated")
     record = convert(named, _OpenCV, file, strict=False)
     matrix, k = record.camera_matrix, tuple(record.distortion_coefficients.data)
     if (matrix.rows, matrix.cols) != (3, 3):

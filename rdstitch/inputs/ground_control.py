@@ -15,7 +15,7 @@ from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.inputs.positions import COLUMNS, UNITS, accuracy_of, geographic_places
 from rdstitch.inputs.rows_of_images import ImagesByName
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import Row, csv_rows, numbered_lines
+from rdstitch.inputs.tables import Row, csv_rows, heading_of, numbered_lines
 from rdstitch.system.file_access import read_text
 
 _ACCURACIES = {name: aliases for name, aliases in COLUMNS.items() if name.endswith("std")}
@@ -30,7 +30,7 @@ _CONTROL = {
     "py": "py imy pixely row v",
     **_ACCURACIES,
 }
-_CONTROL_WANTED = ("x,y,px,py,name", "longitude,latitude,px,py,name")
+_CONTROL_WANTED = ("x,y,px,py,image", "longitude,latitude,px,py,image")
 _CONTROL_LISTED = ("x", "y", "z", "px", "py", "name")
 
 
@@ -47,7 +47,7 @@ def with_ground_control(
         return list(sources)
     system, body = NamedSystem.above(read_text(file))
     rows: Iterable[Row]
-    header = next((line for line in body.splitlines() if line.strip()), "")
+    header, _ = heading_of(body, str(file), _CONTROL, UNITS)
     if re.match(r"\W*[A-Za-z_ ./()]+[,;\t]", header):
         rows = csv_rows(body, str(file), _CONTROL, _CONTROL_WANTED, UNITS)
         epsg = WGS84 if any("latitude" in row.values for row in rows) else epsg

@@ -6,7 +6,7 @@ JSON                              what ``exiftool -json`` writes
 GPX                               a track, in which images have their places by their times
 SRT                               subtitles of a DJI video, a track likewise
 MRK                               events of a DJI receiver, by the number that the images' names end with
-a coordinate system, then lines   OpenDroneMap's ``geo.txt``: NAME X Y [Z … HORIZONTAL VERTICAL ACCURACY]
+a coordinate system, then lines   OpenDroneMap's ``geo.txt``: NAME X Y [Z … HORIZONTAL VERTICAL ACCURACY]; or CSV
 ================================= ====================================================================
 """
 
@@ -25,7 +25,7 @@ from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.inputs.rows_of_images import RowsByImage
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import NUMERAL, Row, csv_rows, json_rows, listed_rows
+from rdstitch.inputs.tables import NUMERAL, Row, csv_rows, heading_of, json_rows, listed_rows
 from rdstitch.inputs.tracks import by_events, is_list_of_events, on_track, subtitle_points, track_points
 from rdstitch.system.file_access import read_text
 
@@ -108,10 +108,10 @@ def _places(sources: Sequence[Source], file: str | Path, epsg: int | None, offse
         named, below = NamedSystem.above(text)
         if text.lstrip().startswith(("[", "{")):
             rows = json_rows(text, name, COLUMNS, _RECORDS)
-        elif named is not None:
-            rows, system = listed_rows(below, name, _LISTED), named
+        elif named is None or heading_of(below, name, COLUMNS, UNITS)[1] > 1:
+            rows, system = csv_rows(below, name, COLUMNS, _WANTED, UNITS), named or system
         else:
-            rows = csv_rows(text, name, COLUMNS, _WANTED, UNITS)
+            rows, system = listed_rows(below, name, _LISTED), named
         named_rows = RowsByImage(row for row in rows if _coordinates(row) is not None)
         places = _by_rows(named_rows.of(sources), name, system)
         if not any(places):
@@ -178,7 +178,7 @@ def geographic_places(system: NamedSystem, places: FloatArray, file: str) -> lis
 def _degrees(row: Row, column: str, reference: str) -> float | None:
     """Degrees, or degrees, minutes and seconds, of this or the other side (N, S, E, W); None where there are none."""
     if not (parts := row.numbers_within(column)):
-        return None
+        return row.number(column)
     text = row.values[column]
     value = sum(abs(part) / 60.0**k for k, part in enumerate(parts[:3]))
     words = re.findall(r"[^\W\d_]+", NUMERAL.sub(" ", text).lower())

@@ -124,12 +124,13 @@ def _pixels(path: Path, message: Any) -> NDArray[Any]:
         raise InputError(f"{path}: images have the encoding {message.encoding}, which is none of {known}")
     kind, channels, to_bgr = _ENCODINGS[message.encoding]
     dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
-    rows = np.asarray(message.data, dtype=np.uint8)[: message.height * message.step].reshape(message.height, -1)
+    height, step, data = message.height, message.step, np.asarray(message.data, dtype=np.uint8)
+    if len(data) < height * step:
+        raise InputError(f"{path}: {len(data)} bytes are too few for {height} rows of {step}")
     needed = message.width * channels
-    if message.step < needed * dtype.itemsize:
-        raise InputError(
-            f"{path}: rows of {message.step} bytes are too short for {message.width} pixels of {message.encoding}"
-        )
+    if step < needed * dtype.itemsize:
+        raise InputError(f"{path}: rows of {step} bytes are too short for {message.width} pixels of {message.encoding}")
+    rows = data[: height * step].reshape(height, step)
     samples = np.ascontiguousarray(rows).view(dtype).astype(kind)[:, :needed]
     if channels > 1:
         samples = samples.reshape(message.height, message.width, channels)

@@ -34,13 +34,14 @@ IMAGE_NAMES, TIME_NAMES = "name filename file image imagename", "timestamp time 
 
 _DELIMITERS = ",;\t"
 _HEADING = re.compile(r"(?:.*:)?([^\[(]*)(?:[\[(]([^\])]*)[\])]?.*)?", re.DOTALL)
-_EMPTY = ("", "-", "nan")
+_EMPTY = ("", "-", "nan", "n/a", "na", "none", "null")
 # A number by its decimal mark; the other mark may stand between groups of three digits.
 _NOTATIONS = {
     mark: re.compile(rf"(?=[-+]?[.,]?\d)[-+]?(\d+|[1-9]\d{{0,2}}(\{other}\d{{3}})+)?(\{mark}\d*)?([eE][-+]?\d+)?")
     for mark, other in (".,", ",.")
 }
 _GROUPED = re.compile(r"(?<=\d)[\s'’](?=\d{3}(?!\d))")
+_BEHIND_A_NAME = re.compile(r"\.[A-Za-z]\w+\s(?!.*\.[A-Za-z]\w+$)")  # words that follow a file's ending
 NUMERAL = re.compile(r"[-+\u2212]?[.,]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+)?")
 
 
@@ -105,8 +106,9 @@ def csv_rows(
 ) -> list[Row]:
     """The rows of a CSV file with a heading; ``wanted`` are the columns that there must be, and alternatives to them.
 
-    Of each column ``columns`` has all headings that mean it, between blanks. Others are ignored; of several with one
-    meaning the last counts that is not empty. ``file`` is what messages call it.
+    They are named by headings, as messages name them. Of each column ``columns`` has all headings that mean it, between
+    blanks. Others are ignored; of several with one meaning the last counts that is not empty. ``file`` is what messages
+    call it.
     """
     if "\0" in text:
         raise InputError(f"{file}: is not UTF-8 text; save it as CSV in UTF-8")
@@ -121,7 +123,7 @@ def csv_rows(
     try:
         headings = next(reader, [])
         meanings = [known(heading) for heading in headings]
-        if not any(set(names.split(",")) <= set(meanings) for names in wanted):
+        if not any({known(name) or name for name in names.split(",")} <= set(meanings) for names in wanted):
             raise InputError(f"{file}: its first line names no columns like {' or '.join(wanted)}")
         rows = []
         for fields in reader:
@@ -133,6 +135,13 @@ def csv_rows(
     except csv.Error as error:
         raise InputError(f"{file}: line {reader.line_num + start}: is not CSV: {error}") from error
     return _rows(rows)
+
+
+def heading_of(text: str, file: str, columns: Mapping[str, str], units: Sequence[str] = ()) -> tuple[str, int]:
+    """The line that :func:`csv_rows` takes for the heading, and how many columns that are known it names."""
+    known = _finder(file, columns, units)
+    line = next((line for line in text.splitlines() if _is_heading(line, known)), "")
+    return line, sum(known(field) is not None for field in re.split(f"[{_DELIMITERS}]", line.lstrip("# ")))
 
 
 def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> list[Row]:
@@ -154,12 +163,14 @@ def numbered_lines(text: str, file: str) -> list[tuple[str, str]]:
 
 
 def listed_rows(text: str, file: str, columns: Sequence[str]) -> list[Row]:
-    """Lines of a name, which may hold blanks, and numbers between blanks; see :func:`numbered_lines`."""
+    """Lines of a name, which may hold blanks, and two numbers or more; see :func:`numbered_lines`."""
     rows = []
     for where, line in numbered_lines(text, file):
         fields = line.split()
-        count = len(list(takewhile(_readings, reversed(fields[1:]))))
+        count = len(list(takewhile(lambda field: _readings(field) or field.lower() in _EMPTY, reversed(fields[1:]))))
         name = line.rsplit(maxsplit=count)[0]
+        if count < 2 or _BEHIND_A_NAME.search(name):
+            raise InputError(f"{where}: expected a name and numbers between blanks, not '{line}'")
         rows.append((where, zip(columns, (name, *fields[len(fields) - count :]), strict=False)))
     return _rows(rows)
 

@@ -244,7 +244,8 @@ class Tracker:
 def _measured(name: str, value: ArrayLike, *shape: int) -> list[float]:
     """The numbers that came with a frame, NaN where a sensor has none."""
     try:
-        numbers = np.asarray(value, dtype=np.float64)
+        # Dates would be numbers, but of days or nanoseconds.
+        numbers = None if np.asarray(value).dtype.kind in "mM" else np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         numbers = None
     if numbers is None or numbers.shape != shape:

@@ -113,7 +113,7 @@ def summary(result: StitchResult | Registration) -> str:
     registration = result.registration if isinstance(result, StitchResult) else result
     alignment, camera, reason = registration.alignment, registration.camera, registration.alignment.model_reason
     used, compared = sum(fit.used for fit in alignment.links), len(registration.pairs)
-    of_copies = f"; {more} more are of copies" if (more := len(alignment.holding) - used) else ""
+    of_copies = f"; {more} more of copies" if (more := len(alignment.holding) - used) else ""
     known = {str(source.path) for source in registration.sources}
     unread = sum(message.images[0] not in known for message in registration.left_out)
     seen = isinstance(result, StitchResult) and result.seams.visible

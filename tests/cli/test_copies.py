@@ -95,7 +95,7 @@ def test_every_output_holds_them(rdstitch: Run, frames: Path, tmp_path: Path, or
     _all_used(page)
     assert _linked(project.read_text(), r"(?m)^c n(\d) N(\d)") == set("01234")
     assert _linked((tmp_path / "report.html").read_text(), r"<title>(\d)\w\.png and (\d)\w\.png: ") == set("01234")
-    assert "more are of copies" in (tmp_path / "report.html").read_text()
+    assert "more of copies" in (tmp_path / "report.html").read_text()
     assert '["matches", "0"]' not in page.with_suffix(".html").read_text()
 
 

@@ -206,8 +206,10 @@ def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
         storage.release()
     rows = f"image_width: 640\nimage_height: 480\nK: {matrix.tolist()}\nD: {coefficients.tolist()}\n"
     (tmp_path / "rows.yml").write_text(rows)
-    found, *same = (read_camera_file(tmp_path / name) for name in ("c.yml", "c.json", "rows.yml"))
-    assert same == [found, found]
+    nested = {"rows": 3, "cols": 3, "data": matrix.tolist()}
+    (tmp_path / "nested.yml").write_text(rows.replace(str(matrix.tolist()), json.dumps(nested)))
+    found, *same = (read_camera_file(tmp_path / name) for name in ("c.yml", "c.json", "rows.yml", "nested.yml"))
+    assert same == [found, found, found]
     with pytest.raises(InputError, match=r"c\.xml: is OpenCV's in XML, .* as YAML or JSON"):
         load_camera(tmp_path / "c.xml")
     assert found.kind == "OpenCV"
@@ -336,6 +338,8 @@ def test_what_others_know_and_rdstitch_does_not_is_named(tmp_path: Path, text: s
     [
         ("c.yml", "cols: 8", "cols: 4", "distortion_coefficients"),
         ("c.yml", "rows: 3", "rows: x", "camera_matrix.rows"),
+        ("c.yml", "camera_matrix:", "camera_matrix: hello\nother:", "camera_matrix: expected rows, cols and data, or"),
+        ("c.yml", "image_width:", 'distortion_model: ""\nimage_width:', "a camera that is not calibrated"),
         ("c.yml", "image_width: 4000\n", "", "image_width"),
         ("c.yml", "3300.0, 0.0, 2013.25", "3300.0, 0.5, 2013.25", "camera_matrix"),
         ("c.yml", "image_height: 3000", "image_height: 3000\n\tx", "line 5"),

@@ -201,6 +201,14 @@ def test_rows_that_are_too_short_for_an_image_are_refused(encoding: str, missing
         _pixels(Path("a.bag"), message)
 
 
+@pytest.mark.parametrize("rows", [0, 3])
+def test_images_with_too_few_bytes_are_refused(rows: int) -> None:
+    message = _message("mono16", np.zeros((6, 8, 1), np.uint16))
+    message.data = message.data[: rows * message.step]
+    with pytest.raises(InputError, match=rf"a\.bag: {rows * 16} bytes are too few for 6 rows of 16"):
+        _pixels(Path("a.bag"), message)
+
+
 def test_of_a_deep_image_eight_bits_are_the_same_at_any_exposure() -> None:
     dark, bright = (_eight_bits((SMOOTH >> by).astype(np.uint16)) for by in (6, 2))
     assert dark.max() == bright.max() == 255

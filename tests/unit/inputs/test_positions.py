@@ -76,6 +76,7 @@ def _read(folder: Path, text: str, epsg: int | None = None, offset: float = 0.0)
         "a.jpg,North,48.8582222222,West,2.2945,35.5\nb.jpg,S,48.8582222222,E,2.2945,\n",
         "# Name;Lat [deg];Lon [deg];Alt (m)\n"
         "C:\\flight\\a.jpg;48,8582222222;-2,2945;35,5\nb.jpg;-48,8582222222;2,2945\n",
+        "EPSG:4326\nname,x,y,z\na.jpg,-2.2945,48.8582222222,35.5\nb.jpg,2.2945,-48.8582222222,\n",
         "EPSG:4326\na.jpg -2.2945 48.8582222222 35.5 0 0 0\n\nb.jpg 2.2945 -48.8582222222\n",
         "\n# of flight 3\nEPSG:4326\na.jpg -2.2945 48.8582222222 35.5\nb.jpg 2.2945 -48.8582222222\n",
     ],
@@ -165,6 +166,10 @@ def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> N
         ),
         ("name,lat,lon\na.jpg,33.85 S,5 O\n", "line 2: expected a longitude like"),
         ("name,lat,lon\na.jpg,48,8582,2,2945\n", "line 2: has 5 fields"),
+        ("name,lat,lon\na.jpg,1,2\nb.jpg,oops,2\n", "line 3: expected a number for latitude, not 'oops'"),
+        ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg oops 5e6\n", "line 3: expected a name and numbers between blanks, not 'b"),
+        ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 500000m 5e6 100 0\n", "line 3: expected a name and numbers between blanks"),
+        ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 5e5 oops 100\n", "line 3: expected a name and numbers between blanks"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, message: str) -> None:
@@ -210,6 +215,9 @@ def test_projected_numbers_in_other_notations_and_zero_longitude(tmp_path: Path)
         ("1 2 3 4 5 a.jpg", "line 1: expected a coordinate system"),
         ("EPSG:4326\n1 2 3 4 a.jpg", "line 2: expected X Y Z PX PY IMAGE"),
         ("\n# surveyed\nEPSG:4326\n1 2 3 4 a.jpg", "line 4: expected X Y Z PX PY IMAGE"),
+        ("EPSG:4326\n# Bob, 2024\n1 2 3 4 a.jpg", "line 3: expected X Y Z PX PY IMAGE"),
+        ("EPSG:4326\n# Bob 2024\nx,y,px,py,image\n1,2,x,4,a.jpg", "line 4: expected a number for px, not 'x'"),
+        ("EPSG:4326\nx,y,px,py,name\n1,2,3,4,a.jpg", "names no columns like x,y,px,py,image or longitude"),
         ("EPSG:4326\n1 2 3 640 5 a.jpg", "line 2: is not within the 640 x 480 pixels of a.jpg"),
         ("EPSG:4326\n1 2 3 nan 5 a.jpg", "line 2: has no number for px"),
         ("EPSG:4326\n1 2 3 4 5 z.jpg", "has no ground control point in any of the images"),

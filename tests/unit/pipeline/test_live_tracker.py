@@ -68,7 +68,14 @@ def test_what_cannot_be_read_is_a_pose_without_a_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "measured", [{"timestamp": "x"}, {"attitude": (0.1, 0.2, 0.3)}, {"attitude": 0.1}, {"odometry": (1.0, 2.0)}]
+    "measured",
+    [
+        {"timestamp": "x"},
+        {"timestamp": np.datetime64("2020-01-01")},
+        {"attitude": (0.1, 0.2, 0.3)},
+        {"attitude": 0.1},
+        {"odometry": (1.0, 2.0)},
+    ],
 )
 def test_what_no_sensor_measures_is_refused_and_no_frame_is_counted(measured: dict[str, Any]) -> None:
     tracker, image = _tracker(), np.zeros((240, 320), np.uint8)
