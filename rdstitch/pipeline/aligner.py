@@ -196,7 +196,7 @@ class Aligner:
                 both = pair.errors(alignment.transfer), pair.own_errors
                 errors.setdefault(among[0], []).append(np.array(both)[:, pair.relation.inliers])
         medians = {copy: np.median(np.concatenate(parts, axis=1), axis=1) for copy, parts in errors.items()}
-        return frozenset(k for k, (by_all, own) in medians.items() if by_all > max(_MISFIT * own, SAME_PX / 2.0))
+        return frozenset(k for k, (by_all, own) in medians.items() if by_all > max(_MISFIT * own, SAME_PX))
 
     def _options_without(self, copies: Mapping[int, int]) -> AlignmentOptions:
         """The options, where the reference, control points and positions are those of what images are copies of."""
