@@ -78,6 +78,7 @@ def _read(folder: Path, text: str, epsg: int | None = None, offset: float = 0.0)
         "C:\\flight\\a.jpg;48,8582222222;-2,2945;35,5\nb.jpg;-48,8582222222;2,2945\n",
         "EPSG:4326\nname,x,y,z\na.jpg,-2.2945,48.8582222222,35.5\nb.jpg,2.2945,-48.8582222222,\n",
         "EPSG:4326\na.jpg -2.2945 48.8582222222 35.5 0 0 0\n\nb.jpg 2.2945 -48.8582222222\n",
+        "EPSG:4326\n# name, x, y\na.jpg -2.2945 48.8582222222 35.5\nb.jpg 2.2945 -48.8582222222\n",
         "\n# of flight 3\nEPSG:4326\na.jpg -2.2945 48.8582222222 35.5\nb.jpg 2.2945 -48.8582222222\n",
     ],
 )
