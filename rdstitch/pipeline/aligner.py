@@ -42,8 +42,8 @@ _EXPLAINED = 0.5
 _WIDTH_PER_SIGMA, _MIN_THRESHOLD = 4.0, 0.5
 # Share of its inliers that a pair must keep; otherwise the alignment does not fit it, and it stays as it is.
 _MIN_KEPT = 0.5
-# Times the errors of its own pairs that a near copy is off by where it needs a motion that the others do not: 20 to 60
-# of rendered ones that are tilted or zoomed, 1.0 of those that are only shifted.
+# Times the errors of its image that a near copy is off by where it needs a motion that the others do not: 20 to 60 of
+# rendered ones that are tilted or zoomed, 1.0 of those that are only shifted.
 _MISFIT = 1.5
 
 
@@ -188,15 +188,19 @@ class Aligner:
     def _misfits(
         self, alignment: Alignment, pairs: Sequence[PairRegistration], near: Mapping[int, int]
     ) -> frozenset[int]:
-        """The near copies whose pairs fit worse to a model that others chose: these show what it lacks."""
+        """The near copies that fit worse than their images to the model that others chose: these show what it lacks."""
         errors: dict[int, list[FloatArray]] = {}
-        for pair in pairs:
-            among = [*(near.keys() & {*pair.images})]
-            if len(among) == 1 and pair.relation and alignment.used[[*pair.images]].all():
-                both = pair.errors(alignment.transfer), pair.own_errors
-                errors.setdefault(among[0], []).append(np.array(both)[:, pair.relation.inliers])
-        medians = {copy: np.median(np.concatenate(parts, axis=1), axis=1) for copy, parts in errors.items()}
-        return frozenset(k for k, (by_all, own) in medians.items() if by_all > max(_MISFIT * own, SAME_PX))
+        for pair in pairs if near else ():
+            if pair.relation and alignment.used[[*pair.images]].all():
+                found = pair.errors(alignment.transfer)[pair.relation.inliers]
+                for image in near.keys() & {*pair.images} or pair.images:
+                    errors.setdefault(image, []).append(found)
+        medians = {image: float(np.median(np.concatenate(parts))) for image, parts in errors.items()}
+        return frozenset(
+            copy
+            for copy, first in near.items()
+            if medians.get(copy, 0.0) > max(_MISFIT * medians.get(first, 0.0), SAME_PX)
+        )
 
     def _options_without(self, copies: Mapping[int, int]) -> AlignmentOptions:
         """The options, where the reference, control points and positions are those of what images are copies of."""
