@@ -190,8 +190,9 @@ class Aligner:
     ) -> frozenset[int]:
         """The near copies that fit worse than their images to the model that others chose: these show what it lacks."""
         errors: dict[int, list[FloatArray]] = {}
-        for pair in pairs if near else ():
-            if pair.relation and alignment.used[[*pair.images]].all():
+        concerned = near.keys() | {*near.values()}
+        for pair in pairs:
+            if concerned & {*pair.images} and pair.relation and alignment.used[[*pair.images]].all():
                 found = pair.errors(alignment.transfer)[pair.relation.inliers]
                 for image in near.keys() & {*pair.images} or pair.images:
                     errors.setdefault(image, []).append(found)
