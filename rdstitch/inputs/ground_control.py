@@ -15,7 +15,7 @@ from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.inputs.positions import COLUMNS, UNITS, accuracy_of, geographic_places
 from rdstitch.inputs.rows_of_images import ImagesByName
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import Row, csv_rows, heading_of, numbered_lines
+from rdstitch.inputs.tables import Row, csv_rows, is_table, numbered_lines
 from rdstitch.system.file_access import read_text
 
 _ACCURACIES = {name: aliases for name, aliases in COLUMNS.items() if name.endswith("std")}
@@ -47,8 +47,7 @@ def with_ground_control(
         return list(sources)
     system, body = NamedSystem.above(read_text(file))
     rows: Iterable[Row]
-    header, _ = heading_of(body, str(file), _CONTROL, UNITS)
-    if re.match(r"\W*[A-Za-z_ ./()]+[,;\t]", header):
+    if is_table(body, str(file), _CONTROL, UNITS):
         rows = csv_rows(body, str(file), _CONTROL, _CONTROL_WANTED, UNITS)
         epsg = WGS84 if any("latitude" in row.values for row in rows) else epsg
     else:
@@ -104,7 +103,7 @@ def _opendronemap(text: str, file: str) -> Iterator[Row]:
     for where, line in numbered_lines(text, file):
         fields = line.split(maxsplit=5)
         if len(fields) < 6:
-            raise InputError(f"{where}: expected X Y Z PX PY IMAGE [NAME]")
+            raise InputError(f"{where}: expected X Y Z PX PY IMAGE [NAME], or a heading like {_CONTROL_WANTED[0]}")
         yield Row(where, dict(zip(_CONTROL_LISTED, fields, strict=True)), ".")
 
 

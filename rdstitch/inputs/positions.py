@@ -25,7 +25,7 @@ from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.inputs.rows_of_images import RowsByImage
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import NUMERAL, Row, csv_rows, heading_of, json_rows, listed_rows
+from rdstitch.inputs.tables import NUMERAL, Row, csv_rows, is_table, json_rows, listed_rows
 from rdstitch.inputs.tracks import by_events, is_list_of_events, on_track, subtitle_points, track_points
 from rdstitch.system.file_access import read_text
 
@@ -108,7 +108,7 @@ def _places(sources: Sequence[Source], file: str | Path, epsg: int | None, offse
         named, below = NamedSystem.above(text)
         if text.lstrip().startswith(("[", "{")):
             rows = json_rows(text, name, COLUMNS, _RECORDS)
-        elif named is None or _is_table(below, name):
+        elif named is None or is_table(below, name, COLUMNS, UNITS):
             rows, system = csv_rows(below, name, COLUMNS, _WANTED, UNITS), named or system
         else:
             rows, system = listed_rows(below, name, _LISTED), named
@@ -117,12 +117,6 @@ def _places(sources: Sequence[Source], file: str | Path, epsg: int | None, offse
         if not any(places):
             raise InputError(f"{file}: has no position of {sources[0].name}, nor of any other of the images")
     return places
-
-
-def _is_table(text: str, file: str) -> bool:
-    """Whether it begins with a heading; a comment that names columns may stand above a list too."""
-    heading, known = heading_of(text, file, COLUMNS, UNITS)
-    return known > 1 and not heading.startswith("#")
 
 
 def _by_rows(rows: Sequence[Row | None], file: str, system: NamedSystem | None) -> list[GpsPosition | None]:

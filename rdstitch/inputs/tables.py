@@ -41,7 +41,7 @@ _NOTATIONS = {
     for mark, other in (".,", ",.")
 }
 _GROUPED = re.compile(r"(?<=\d)[\s'’](?=\d{3}(?!\d))")
-_BEHIND_A_NAME = re.compile(r"\.[A-Za-z]\w+\s(?!.*\.[A-Za-z]\w+$)")  # words that follow a file's ending
+_BEHIND_A_NAME = re.compile(r"\.[A-Za-z]\w+\s(?!.*(\.[A-Za-z]\w+$|[\\/]))")  # words that follow a file's ending
 NUMERAL = re.compile(r"[-+\u2212]?[.,]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+)?")
 
 
@@ -116,10 +116,9 @@ def csv_rows(
     lines = list(io.StringIO(text, newline=None))
     start = next((n for n, line in enumerate(lines) if _is_heading(line, known)), 0)
     heading = lines[start].lstrip("# ") if lines else ""
-    delimiter = max(_DELIMITERS, key=heading.count)
     # Comments become empty lines, so that the others keep their numbers.
     rest = ("" if line.startswith("#") else line for line in lines[start + 1 :])
-    reader = csv.reader([heading, *rest], delimiter=delimiter, skipinitialspace=True, strict=True)
+    reader = csv.reader([heading, *rest], delimiter=_delimiter(heading), skipinitialspace=True, strict=True)
     try:
         headings = next(reader, [])
         meanings = [known(heading) for heading in headings]
@@ -137,11 +136,12 @@ def csv_rows(
     return _rows(rows)
 
 
-def heading_of(text: str, file: str, columns: Mapping[str, str], units: Sequence[str] = ()) -> tuple[str, int]:
-    """The line that :func:`csv_rows` takes for the heading, and how many columns that are known it names."""
+def is_table(text: str, file: str, columns: Mapping[str, str], units: Sequence[str] = ()) -> bool:
+    """Whether it is what :func:`csv_rows` reads, not a list, above which a comment may name columns too."""
     known = _finder(file, columns, units)
-    line = next((line for line in text.splitlines() if _is_heading(line, known)), "")
-    return line, sum(known(field) is not None for field in re.split(f"[{_DELIMITERS}]", line.lstrip("# ")))
+    heading = next((line for line in text.splitlines() if _is_heading(line, known)), "")
+    first = next((line for _, line in numbered_lines(text, file)), "")
+    return _names_columns(heading, known) and _delimiter(heading) in first
 
 
 def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> list[Row]:
@@ -163,16 +163,23 @@ def numbered_lines(text: str, file: str) -> list[tuple[str, str]]:
 
 
 def listed_rows(text: str, file: str, columns: Sequence[str]) -> list[Row]:
-    """Lines of a name, which may hold blanks, and two numbers or more; see :func:`numbered_lines`."""
+    """Lines of a name, which may hold blanks, two numbers or more, and other words; see :func:`numbered_lines`."""
     rows = []
     for where, line in numbered_lines(text, file):
         fields = line.split()
-        count = len(list(takewhile(lambda field: _readings(field) or field.lower() in _EMPTY, reversed(fields[1:]))))
-        name = line.rsplit(maxsplit=count)[0]
-        if count < 2 or _BEHIND_A_NAME.search(name):
+        found = ((end, _numbers_before_words(fields[end : end + len(columns) - 1])) for end in range(1, len(fields)))
+        end, numbers = next(((end, numbers) for end, numbers in found if numbers), (1, []))
+        name = line.rsplit(maxsplit=len(fields) - end)[0]
+        if not numbers or _BEHIND_A_NAME.search(name):
             raise InputError(f"{where}: expected a name and numbers between blanks, not '{line}'")
-        rows.append((where, zip(columns, (name, *fields[len(fields) - count :]), strict=False)))
+        rows.append((where, zip(columns, (name, *numbers), strict=False)))
     return _rows(rows)
+
+
+def _numbers_before_words(fields: Sequence[str]) -> list[str]:
+    """The numbers that the fields begin with, where they are two or more and no word behind them begins like one."""
+    numbers = list(takewhile(lambda field: _readings(field) or field.lower() in _EMPTY, fields))
+    return [] if len(numbers) < 2 or any(map(NUMERAL.match, fields[len(numbers) :])) else numbers
 
 
 def _rows(found: Iterable[tuple[str, Iterable[tuple[str | None, Any]]]]) -> list[Row]:
@@ -227,6 +234,12 @@ def _finder(file: str, columns: Mapping[str, str], units: Sequence[str]) -> Call
 
 def _is_heading(line: str, known: Callable[[str], str | None]) -> bool:
     """Check whether a line is the heading: the first one that is no comment, or a comment that names columns."""
-    if not line.startswith("#"):
-        return bool(line.strip())
+    return _names_columns(line, known) if line.startswith("#") else bool(line.strip())
+
+
+def _names_columns(line: str, known: Callable[[str], str | None]) -> bool:
     return sum(known(field) is not None for field in re.split(f"[{_DELIMITERS}]", line.lstrip("# "))) > 1
+
+
+def _delimiter(heading: str) -> str:
+    return max(_DELIMITERS, key=heading.count)

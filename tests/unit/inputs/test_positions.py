@@ -78,6 +78,7 @@ def _read(folder: Path, text: str, epsg: int | None = None, offset: float = 0.0)
         "C:\\flight\\a.jpg;48,8582222222;-2,2945;35,5\nb.jpg;-48,8582222222;2,2945\n",
         "EPSG:4326\nname,x,y,z\na.jpg,-2.2945,48.8582222222,35.5\nb.jpg,2.2945,-48.8582222222,\n",
         "EPSG:4326\na.jpg -2.2945 48.8582222222 35.5 0 0 0\n\nb.jpg 2.2945 -48.8582222222\n",
+        "EPSG:4326\n# name,x,y,z\na.jpg,-2.2945,48.8582222222,35.5\nb.jpg,2.2945,-48.8582222222\n",
         "EPSG:4326\n# name, x, y\na.jpg -2.2945 48.8582222222 35.5\nb.jpg 2.2945 -48.8582222222\n",
         "\n# of flight 3\nEPSG:4326\na.jpg -2.2945 48.8582222222 35.5\nb.jpg 2.2945 -48.8582222222\n",
     ],
@@ -171,6 +172,8 @@ def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> N
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg oops 5e6\n", "line 3: expected a name and numbers between blanks, not 'b"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 500000m 5e6 100 0\n", "line 3: expected a name and numbers between blanks"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 5e5 oops 100\n", "line 3: expected a name and numbers between blanks"),
+        ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 5e5 5e6 1OO 0\n", "line 3: expected a name and numbers between blanks"),
+        ("EPSG:32633\na.jpg 5e5 5e6 9 0 0 0 .02m .04\n", "line 2: expected a name and numbers between blanks"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, message: str) -> None:
@@ -200,6 +203,20 @@ def test_control_points(tmp_path: Path) -> None:
     file.write_text("WGS84 UTM 34S\n268832 6246117 12 1 2 DJI a.jpg the post\n268832 6246117 12\t3\t4\tDJI b.jpg\n")
     one, two, _ = (source.control for source in with_ground_control(sources, file))
     assert [(c.name, c.pixel) for c in (*one, *two)] == [("the post", (1.0, 2.0)), ("268832 6246117", (3.0, 4.0))]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        "# x, y, z, px, py, image\n500000 5300000 5 30 20 a.jpg",
+        "500000\t5300000\t5\t30\t20\ta.jpg",
+        "# x;y;px;py;image\n500000;5300000;30;20;a.jpg",
+    ],
+)
+def test_a_list_of_control_points_is_told_from_a_table(tmp_path: Path, lines: str) -> None:
+    (tmp_path / "gcp").write_text(f"EPSG:32632\n{lines}\n", encoding="utf-8")
+    (point,) = with_ground_control(_sources(), tmp_path / "gcp")[0].control
+    assert (point.name, point.pixel) == ("500000 5300000", (30.0, 20.0))
 
 
 def test_projected_numbers_in_other_notations_and_zero_longitude(tmp_path: Path) -> None:
@@ -264,7 +281,7 @@ def test_names_in_other_case_and_accuracies_in_tables(tmp_path: Path) -> None:
     one, two, _ = _read(tmp_path, f"{header}\nA.JPG,1,2,0.03,0.04,0.05\nb.jpg,1,3,,,\n")
     assert one.std == pytest.approx((0.05 / 2**0.5, 0.05))
     assert two == GpsPosition(1.0, 3.0)
-    geo = "EPSG:4326\na.jpg 2 1 50 0 0 0 0.02 0.04\nb.jpg 3 1\n"
+    geo = "EPSG:4326\na.jpg 2 1 50 0 0 0 0.02 0.04 fixed 3D\nb.jpg 3 1\n"
     assert _read(tmp_path, geo)[0].std == (0.02, 0.04)
 
 
