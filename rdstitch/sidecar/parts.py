@@ -27,12 +27,17 @@ from rdstitch.sidecar.records import (
 )
 
 
-def recorded_path(path: Path, output: Path | None, *, was_file: bool = False) -> str:
+def recorded_path(path: Path, output: Path | None) -> str:
     """A file as the sidecar of an output has it, from its folder on; an absolute name, or what is no file, as it is."""
-    if output is None or path.is_absolute() or not (was_file or path.exists()):
-        return str(path)
-    named, folder = path.parent.resolve() / path.name, output.parent.resolve()
-    return str(named) if named.drive != folder.drive else Path(os.path.relpath(named, folder)).as_posix()
+    return rebased_path(path, Path(), output) if path.exists() else str(path)
+
+
+def rebased_path(path: Path, folder: Path, output: Path | None) -> str:
+    """A path from a folder on, as one from the folder of an output on; an absolute one as it is."""
+    if output is None or path.is_absolute():
+        return str(folder / path)
+    named, target = (folder / path.parent).resolve() / path.name, output.parent.resolve()
+    return str(named) if named.drive != target.drive else Path(os.path.relpath(named, target)).as_posix()
 
 
 def taken_fields(source: Source) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """The sidecar of an image that was composed again: what was estimated then, of the images that are in it now."""
 
+from pathlib import Path
 from typing import Any
 
 from msgspec import UNSET
@@ -11,6 +12,7 @@ from rdstitch.geometry.exif_orientation import inverse
 from rdstitch.sidecar.parts import (
     displacement_record,
     output_record,
+    rebased_path,
     recorded_path,
     seams_record,
     taken_fields,
@@ -93,8 +95,9 @@ def _unused_image(result: Recomposition, index: int) -> ImageRecord:
     lens = {} if image.camera is None else lens_fields(image.camera)
     reason = image.reason if left_out is None else left_out.text
     gone = {"used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
-    if not is_url(image.path):
-        gone["path"] = recorded_path(result.saved.path.parent / image.path, result.output, was_file=True)
+    # An array has a name without an ending, and no file.
+    if not is_url(image.path) and (Path(image.path).suffix or result.saved.original(image)):
+        gone["path"] = rebased_path(Path(image.path), result.saved.path.parent, result.output)
     return replace_fields(image, **lens, **gone, lambda2=UNSET)
 
 

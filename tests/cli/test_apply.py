@@ -161,6 +161,26 @@ def test_originals_are_found_from_the_folder_of_the_sidecar(
     assert any("was not compared" in message.text for message in apply(sidecar, [shifted]).messages)
 
 
+@pytest.mark.parametrize("given", ["files", "files that are gone", "arrays"])
+def test_images_that_are_left_out_keep_their_paths(
+    frames: list[Path], stranger: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str
+) -> None:
+    """From the folder of the new sidecar on, though the other one was named absolutely."""
+    flight, new = copied([*frames[:2], stranger], tmp_path / "flight"), tmp_path / "new" / "o.tif"
+    new.parent.mkdir()
+    monkeypatch.chdir(tmp_path / "flight")
+    images = [cv2.imread(file.name) if given == "arrays" else file.name for file in flight]
+    mosaic(images, "o.tif", OPTIONS)
+    if given == "files that are gone":
+        flight[2].unlink()
+        del images[2]
+    apply(tmp_path / "flight" / "o.tif.json", images, new)
+    names = [f"image_{k:04}" for k in range(3)] if given == "arrays" else [f"../flight/{file.name}" for file in flight]
+    written = sidecar_of(new)["images"]
+    assert [image["path"] for image in written] == names
+    assert [image["used"] for image in written] == [True, True, False]
+
+
 def test_equal_names_of_another_flight_are_refused_and_other_images_named(
     frames: list[Path], stitched: Path, tmp_path: Path
 ) -> None:
