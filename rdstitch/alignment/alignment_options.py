@@ -108,7 +108,7 @@ class GivenImages:
     cameras: Sequence[Camera]
     links: Sequence[Link]
     options: AlignmentOptions
-    # Images that show next to nothing but what another one does, each with that one, and their links: they are placed
+    # Images that show almost only what another one shows, each with that one, and their links: they are placed
     # by these when all the rest is known
     near_copies: Mapping[int, int] = field(default_factory=dict)
     links_of_copies: Sequence[Link] = ()

@@ -1,4 +1,4 @@
-"""Images that show next to nothing but what another one does: each is placed by its links when all else is known."""
+"""Images that show almost only what another one shows: each is placed by its links when all else is known."""
 
 from collections.abc import Mapping
 from dataclasses import replace

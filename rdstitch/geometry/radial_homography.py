@@ -192,7 +192,7 @@ def measurement_whitening(by_point: FloatArray, common: FloatArray | None = None
     A point measured with the same noise in both images is transferred with covariance ``I + J J'``, J = ``by_point``
     (N, 2, 2) the derivative of the transferred by the original point, both in pixels. The upper triangular ``W`` has
     ``W'W = ((I + J J') / 2)⁻¹``: of the size of the error in one image. ``common`` (N, 2), a random displacement of the
-    transferred point of one standard deviation, over that of the noise, is added to the covariance squared.
+    transferred point of one standard deviation, over that of the noise, adds its square to the covariance.
     """
     (ax, ay), (bx, by) = by_point.transpose(1, 2, 0)
     xx, yy, xy = (1.0 + ax * ax + ay * ay) / 2.0, (1.0 + bx * bx + by * by) / 2.0, (ax * bx + ay * by) / 2.0

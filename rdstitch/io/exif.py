@@ -1,6 +1,6 @@
-"""What EXIF says of a camera and of when and where it was, and blocks of it without what is not true any more.
+"""What EXIF says of a camera and of when and where it was, and EXIF blocks without tags that no longer hold.
 
-Nonsense is taken for nothing.
+Implausible values count as missing.
 """
 
 import math

@@ -56,8 +56,8 @@ def extract_frames(path: Path, folder: Path, wanted: Callable[[int], bool]) -> t
             written.append(VideoFrame(file, number, timestamp))
     if not written:
         raise InputError(f"{path}: the video has no frame that can be read")
-    undecoded = f"{lost} frame{'s' * (lost != 1)} cannot be decoded and {'is' if lost == 1 else 'are'} left out"
-    return written, "; ".join([damage] * bool(damage) + [undecoded] * bool(lost))
+    frames = "1 frame cannot be decoded and is" if lost == 1 else f"{lost} frames cannot be decoded and are"
+    return written, "; ".join(filter(None, (damage, f"{frames} left out" if lost else "")))
 
 
 def grabbed_frames(path: Path) -> Iterator[tuple[int, float, cv2.VideoCapture]]:

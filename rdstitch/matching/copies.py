@@ -29,7 +29,7 @@ def copies_of(pairs: Sequence[PairRegistration]) -> dict[int, int]:
 
 
 def near_copies_of(pairs: Mapping[Pair, PairRegistration]) -> dict[int, int]:
-    """Of each image that shows next to nothing but what another one does, that one; registered pairs by their images.
+    """Of each image that shows almost only what another one shows, that one; registered pairs by their images.
 
     Whatever it overlaps with, so does that one: else it may be the only one that joins some images.
     """

@@ -63,6 +63,11 @@ class PairRegistration:
         expected = transfer(self.image1, self.image2, matched.points1)
         return np.asarray(np.nan_to_num(np.linalg.norm(expected - matched.points2, axis=1), nan=np.inf))
 
+    @property
+    def own_errors(self) -> FloatArray:
+        """How far each match, (M,), is from where the relation of the pair expects it, pixels."""
+        return self.errors(lambda _first, _second, points: self.relation.transfer(points))
+
     def link(self) -> Link:
         """The inliers, as global adjustment takes them."""
         inliers = self.relation.inliers

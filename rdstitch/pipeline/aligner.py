@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
 from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
-from rdstitch.alignment.least_squares.plane_marks import Sighting
 from rdstitch.alignment.near_copies import without_measurements
 from rdstitch.alignment.result import LinkFit, Unused
 from rdstitch.arrays import FloatArray
@@ -42,8 +42,8 @@ _EXPLAINED = 0.5
 _WIDTH_PER_SIGMA, _MIN_THRESHOLD = 4.0, 0.5
 # Share of its inliers that a pair must keep; otherwise the alignment does not fit it, and it stays as it is.
 _MIN_KEPT = 0.5
-# Times the errors of its image that a near copy is off by where it needs a motion that the others do not: 20 to 60 of
-# rendered ones that are tilted or zoomed, 1.0 of those that are only shifted.
+# Times the errors of its image, and of its pairs on their own, that a near copy is off by where it needs a motion that
+# the others do not: 20 to 60 of rendered ones that are tilted or zoomed, 1.0 of those that are only shifted.
 _MISFIT = 1.5
 
 
@@ -148,8 +148,8 @@ class Aligner:
         every = np.concatenate(errors)
         return alignment.on_sphere or not len(every) or bool(np.mean(every < self.threshold) > _EXPLAINED)
 
-    def _drafted(self, pairs: Sequence[PairRegistration], others: frozenset[int] = frozenset()) -> AlignedPairs:
-        """The images aligned, near copies among them placed afterwards; but ``others`` are aligned as all are."""
+    def _drafted(self, pairs: Sequence[PairRegistration], counted: frozenset[int] = frozenset()) -> AlignedPairs:
+        """The images aligned; near copies are placed afterwards, but for those that are ``counted`` as all are."""
         if not any(pair.relation for pair in pairs):
             raise RegistrationError(_no_overlap(self.paths, pairs))
         copies = copies_of(pairs)
@@ -159,7 +159,7 @@ class Aligner:
             related = distinct(pairs, copies)
         options = self._options_without(copies)
         near = without_measurements(near_copies_of(related), options)
-        near = {copy: first for copy, first in near.items() if copy not in others}
+        near = {copy: first for copy, first in near.items() if copy not in counted}
         evidence = [ends for ends in related if not near.keys() & {*ends}]
         if not evidence:
             near, evidence = {}, [*related]
@@ -181,45 +181,48 @@ class Aligner:
             return alignment.with_messages([self._counted_once(twice)] if twice else [])
 
         draft = complete("draft", lambda: task.draft)
-        if misfits := self._misfits(draft, pairs, near):
-            return self._drafted(pairs, others | misfits)
+        if misfits := self._misfits(draft, related, near):
+            with_them = self._drafted(pairs, counted | misfits)
+            if with_them.alignment.model != draft.model:  # so little new ground tells of motion, but not of the lens
+                return with_them
         return AlignedPairs(tuple(pairs), draft, completed=lambda: complete("alignment", lambda: task.result))
 
     def _misfits(
-        self, alignment: Alignment, pairs: Sequence[PairRegistration], near: Mapping[int, int]
+        self, alignment: Alignment, related: Mapping[Pair, PairRegistration], near: Mapping[int, int]
     ) -> frozenset[int]:
-        """The near copies that fit worse than their images to the model that others chose: these show what it lacks."""
+        """The near copies that a model fits worse than their images, and than their pairs fit on their own."""
         errors: dict[int, list[FloatArray]] = {}
         concerned = near.keys() | {*near.values()}
-        for pair in pairs:
-            if concerned & {*pair.images} and pair.relation and alignment.used[[*pair.images]].all():
-                found = pair.errors(alignment.transfer)[pair.relation.inliers]
-                for image in near.keys() & {*pair.images} or pair.images:
-                    errors.setdefault(image, []).append(found)
-        medians = {image: float(np.median(np.concatenate(parts))) for image, parts in errors.items()}
+        for ends, pair in related.items():
+            copies = near.keys() & {*ends}
+            if concerned & {*ends} and len(copies) < 2 and alignment.used[[*ends]].all():
+                both = np.array([pair.errors(alignment.transfer), pair.own_errors])[:, pair.relation.inliers]
+                for image in copies or ends:
+                    errors.setdefault(image, []).append(both)
+        medians = dict.fromkeys(concerned, np.zeros(2))
+        medians |= {image: np.median(np.concatenate(parts, axis=1), axis=1) for image, parts in errors.items()}
         return frozenset(
             copy
             for copy, first in near.items()
-            if medians.get(copy, 0.0) > max(_MISFIT * medians.get(first, 0.0), SAME_PX)
+            if medians[copy][0] > max(_MISFIT * medians[first][0], _MISFIT * medians[copy][1], SAME_PX)
         )
 
     def _options_without(self, copies: Mapping[int, int]) -> AlignmentOptions:
-        """The options, where the reference, control points and positions are those of what images are copies of."""
-        reference, control = self.options.reference, list[Sighting]()
-        for one in self.options.control:
+        """The options without copies: what is given of one is given of the image that it is a copy of."""
+        given, quarters = self.options, self._quarters
+        control = []
+        for one in given.control:
             first = copies.get(one.image, one.image)
-            upright = self._quarters.point(np.array(one.offset), one.image)
-            x, y = self._quarters.back.point(upright, first).tolist()
+            x, y = quarters.back.point(quarters.point(np.array(one.offset), one.image), first).tolist()
             control.append(replace(one, image=first, offset=(x, y)))
-        reference = None if reference is None else copies.get(reference, reference)
-        positions, deviations = self.options.positions, self.options.positions_std
-        if positions is not None:
-            positions, deviations = np.array(positions, dtype=np.float64), np.array(deviations, dtype=np.float64)
-            for copy, first in copies.items():
-                if np.isnan(positions[first]).any():
-                    positions[first], deviations[first] = positions[copy], deviations[copy]
+        upright = None if given.gravity is None else _filled(quarters.directions(given.gravity), copies)
         return replace(
-            self.options, reference=reference, control=tuple(control), positions=positions, positions_std=deviations
+            given,
+            reference=None if given.reference is None else copies.get(given.reference, given.reference),
+            control=tuple(control),
+            positions=_filled(given.positions, copies),
+            positions_std=_filled(given.positions_std, copies),
+            gravity=None if upright is None else quarters.back.directions(upright),
         )
 
     def _links_of_copies(self, alignment: Alignment, pairs: Sequence[PairRegistration]) -> Iterator[LinkFit]:
@@ -234,7 +237,7 @@ class Aligner:
 
     def _counted_once(self, twice: Iterable[int]) -> Message:
         names = shortened(names_of(self.paths[k] for k in sorted(twice)))
-        text = f"counted once, because they show next to nothing but what other images do: {names}"
+        text = f"counted once, because they show almost only what other images show: {names}"
         return Message(text, severity="detail", code="copies")
 
     def _recalled(self, stage: str, task: AlignmentTask, compute: Callable[[], Alignment]) -> Alignment:
@@ -252,6 +255,17 @@ class Aligner:
         if aligned.alignment.poses is not None or aligned.alignment.on_sphere or self.options.model != "auto":
             return aligned
         return replace(self, options=replace(self.options, model="pose")).draft(aligned.pairs)
+
+
+def _filled(rows: ArrayLike | None, copies: Mapping[int, int]) -> FloatArray | None:
+    """Rows (N, …), one an image, those that are NaN from a copy of the image."""
+    if rows is None:
+        return None
+    result = np.array(rows, dtype=np.float64)
+    for copy, first in copies.items():
+        if np.isnan(result[first]).any():
+            result[first] = result[copy]
+    return result
 
 
 def draft_with_loops(

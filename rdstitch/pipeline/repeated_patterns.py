@@ -121,8 +121,9 @@ def match_crossings(
         new = [k for k in np.flatnonzero(alignment.used).tolist() if k not in crossings]
         with ThreadPoolExecutor(workers) as pool:
             crossings.update(zip(new, pool.map(crossings_of, new), strict=True))
+        holding = {fit.images for fit in alignment.holding}
         pairs = [
-            _matched(pair, alignment, crossings, aligner.threshold) if pair.images in alignment.support else pair
+            _matched(pair, alignment, crossings, aligner.threshold) if pair.images in holding else pair
             for pair in aligned.pairs
         ]
         if all(new is old for new, old in zip(pairs, aligned.pairs, strict=True)):

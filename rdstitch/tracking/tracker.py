@@ -189,7 +189,8 @@ class FrameTracker:
 
     def _with_checked_camera(self, latest: TrackedFrame) -> list[TrackingResult]:
         """Earlier frames whose places are others, or surer, by what keyframes show of a camera that was given."""
-        focal, changed = self._knowledge.focal, check_given_camera(self._map, latest.frame, self._report)
+        focal = self._knowledge.focal
+        changed = check_given_camera(self._map, latest.frame, self._report)
         if self._knowledge.focal != focal:
             self._refinement.drop()
         return self._revised(self._map.revise(), latest) if changed else []

@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from examples.worlds.alignment_scenes import grid_scene
+from examples.worlds.alignment_scenes import grid, grid_scene, scene
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.alignment.least_squares.plane_marks import Sighting
+from rdstitch.alignment.motion_models import X
+from rdstitch.alignment.result import Unused
 from rdstitch.features import Correspondences
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import to_plane
@@ -53,12 +55,46 @@ def test_a_control_point_in_a_copy_counts(moved: float, orientation: int) -> Non
     assert found.leverage["P0"] > 0.05
 
 
-def test_a_position_that_a_copy_alone_has_is_that_of_its_image() -> None:
-    positions, deviations = np.full((2, 2), np.nan), np.full(2, np.nan)
-    positions[1], deviations[1] = (3.0, 4.0), 2.0
-    options = AlignmentOptions(positions=positions, positions_std=deviations)
-    aligner = Aligner(("a", "b"), (Camera((640, 480)),) * 2, options, NO_CACHE, 3.0)
+def test_what_a_copy_alone_has_is_given_of_its_image() -> None:
+    """The direction of gravity in the axes of that image, where a camera lay on its side, too."""
+    rows = {"positions": [3.0, 4.0], "positions_std": 2.0, "gravity": [0.6, 0.0, 0.8]}
+    given = {name: np.array([np.full_like(row, np.nan), row]) for name, row in rows.items()}
+    options = AlignmentOptions(**given)  # type: ignore[arg-type]
+    quarters = QuarterTurns((1, 6))
+    aligner = Aligner(("a", "b"), (Camera((640, 480)),) * 2, options, NO_CACHE, 3.0, quarters=quarters)
     found = aligner._options_without({1: 0})
     np.testing.assert_array_equal(found.positions, [[3.0, 4.0]] * 2)
     np.testing.assert_array_equal(found.positions_std, [2.0, 2.0])
-    assert np.isnan(positions[0]).all()
+    np.testing.assert_array_equal(found.gravity, [quarters.directions(given["gravity"])[1], rows["gravity"]])
+    assert np.isnan(given["positions"][0]).all()
+
+
+@pytest.mark.parametrize(("relief", "noise"), [(0.08, 0.0), (0.0, 0.5)])
+def test_a_near_copy_over_relief_or_blurred_is_counted_once(relief: float, noise: float) -> None:
+    """Its image is off as much where another copy, whose pair with it fits, is there as well; so are its own pairs."""
+    rng = np.random.default_rng(2)
+    poses = grid(3, 2, (0.4, 0.3), 0.2, rng)
+    poses = np.vstack([poses, poses[4]])
+    poses[6, X] += 0.008
+    given = scene(poses, rng=rng, per_link=120, noise=0.2, outliers=0.0, relief=relief)
+    camera = Camera((640, 480), distortion=given.distortion)
+    links = []
+    for link in given.links:
+        to_second = given.truth[link.image2] @ np.linalg.inv(given.truth[link.image1])
+        relation = replace(link.relation, homography=to_second, camera=camera, camera2=camera)
+        blurred = noise if 6 in (link.image1, link.image2) else 0.0
+        links.append(replace(link, points2=link.points2 + rng.normal(0.0, blurred, (len(link), 2)), relation=relation))
+    again = [
+        replace(link, **{end: 7})  # type: ignore[arg-type]
+        for link in links
+        for end in ("image1", "image2")
+        if getattr(link, end) == 4
+    ]
+    copy = replace(links[0], image1=4, image2=7, points2=links[0].points1)
+    copy = replace(copy, relation=replace(copy.relation, homography=np.eye(3)))
+    pairs = [_registered(link) for link in (*links, *again, copy)]
+    options = AlignmentOptions(model="auto", lens="division")
+    aligner = Aligner(tuple("abcdefgh"), (given.cameras[0],) * 8, options, NO_CACHE, 3.0)
+    found = aligner.align(pairs).alignment
+    assert found.used.all()
+    assert {fit.reason for fit in found.links if 6 in fit.images} == {Unused.COPY}
