@@ -15,6 +15,7 @@ Box = tuple[int, int, int, int]
 Float32Array = NDArray[np.float32]
 # All of them in ordinary folders; a survey with 70 and 50 % of overlap has about 20.
 _MAX_NEIGHBOURS = 20
+_BOXES_AT_ONCE = 256  # that are compared with the others: of 10,000 each may have hundreds beside it
 
 
 def intersection(first: Box, second: Box) -> Box | None:
@@ -78,18 +79,25 @@ def overlapping_pairs(boxes: Sequence[Box | None], most: int = _MAX_NEIGHBOURS) 
     along = int(np.ptp(edges[:, 1]) > np.ptp(edges[:, 0]))
     order = np.argsort(edges[:, along], kind="stable")
     present, edges = present[order], edges[order]
-    place = np.arange(len(edges))
-    later = np.searchsorted(edges[:, along], edges[:, along + 2]) - place - 1
-    first = np.repeat(place, later)
-    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later)
-    sides = np.minimum(edges[first, 2:], edges[second, 2:]) - np.maximum(edges[first, :2], edges[second, :2])
-    both = (sides > 0).all(axis=1)
-    first, second, sides = first[both], second[both], sides[both]
+    place, last = np.arange(len(edges)), np.searchsorted(edges[:, along], edges[:, along + 2])
+    found = [np.zeros((2, 0), dtype=np.intp)]
+    for part in np.split(place, np.arange(_BOXES_AT_ONCE, len(place), _BOXES_AT_ONCE)):
+        later = last[part] - part - 1
+        first = np.repeat(part, later)
+        second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later)
+        found.append(np.stack([first, second])[:, (_sides(edges, first, second) > 0).all(axis=1)])
+    first, second = np.concatenate(found, axis=1)
+    sides = _sides(edges, first, second)
     areas = (edges[:, 2:] - edges[:, :2]).prod(axis=1)
     share = sides.prod(axis=1) / np.minimum(areas[first], areas[second])
     pairs = np.sort(np.stack([present[first], present[second]], axis=1), axis=1)[:, ::-1]
     ascending = np.lexsort((pairs[:, 1], pairs[:, 0]))
     return _largest(pairs[ascending], share[ascending], len(boxes), most)
+
+
+def _sides(edges: NDArray[np.intp], first: NDArray[np.intp], second: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Width and height (P, 2) of what boxes have in common, by their edges (N, 4); not positive without any."""
+    return np.minimum(edges[first, 2:], edges[second, 2:]) - np.maximum(edges[first, :2], edges[second, :2])
 
 
 def _largest(pairs: NDArray[np.intp], share: FloatArray, count: int, most: int) -> NDArray[np.intp]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import combinations
 from typing import Any
 
@@ -77,7 +78,7 @@ class Renderer:
     def shown(self, box: Box) -> set[int]:
         """Find the images that a tile takes samples from, but for those where the seam map misses a pixel."""
         around = self.support(box)
-        reaching = {index for index, warp in enumerate(self.warps) if intersection(warp.box, around) is not None}
+        reaching = set(self._reaching(around))
         if self.seams is None:
             return reaching
         owners = set(self.seams.owners(around))
@@ -91,7 +92,7 @@ class Renderer:
         It takes one of so many shares of the memory.
         """
         around = self.support(box)
-        chosen = [index for index, warp in enumerate(self.warps) if intersection(warp.box, around) is not None]
+        chosen = self._reaching(around)
         part = replace(
             self,
             warps=[self.warps[index] for index in chosen],
@@ -100,6 +101,18 @@ class Renderer:
             seams=None if self.seams is None else self.seams.part(around, chosen),
         )
         return part, tuple(chosen)
+
+    def _reaching(self, box: Box) -> list[int]:
+        """The images whose bounds have pixels in common with a box."""
+        low, high = self._bounds[:, :2], self._bounds[:, 2:]
+        common = np.minimum(high, box[2:]) > np.maximum(low, box[:2])
+        chosen: list[int] = np.flatnonzero(common.all(axis=1)).tolist()
+        return chosen
+
+    @cached_property
+    def _bounds(self) -> NDArray[np.intp]:
+        """Of every image, (N, 4): tiles look at all of them."""
+        return np.array([warp.box for warp in self.warps], dtype=np.intp).reshape(-1, 4)
 
     def layer(self, index: int, box: Box) -> tuple[NDArray[Any], NDArray[np.bool_], NDArray[np.bool_]]:
         """One image on its own in a box: samples (h, w, C), what it covers, and what of that the composite shows."""
@@ -193,9 +206,9 @@ class Renderer:
 
     def _bordered(self, box: Box, wanted: NDArray[np.bool_] | None = None) -> Iterator[Layer]:
         """Every image that covers part of a box, or of what is wanted of it, with weights that fall to its border."""
-        for index, warp in enumerate(self.warps):
-            if (part := intersection(warp.box, box)) is None:
-                continue
+        for index in self._reaching(box):
+            part = intersection(self.warps[index].box, box)
+            assert part is not None
             geometry = self._placed(index, part, box)
             inside = geometry.inside if wanted is None else geometry.inside & cut(wanted, box, part)
             if (shown := bounds(inside, part)) is None:

@@ -120,7 +120,8 @@ def measure_seams(
     pairs, at = _border_places(labels, label_size)
     searchable: dict[int, dict[int, BoolArray]] = {}  # by image
     found: list[tuple[IntArray, FloatArray, _Verdict]] = []
-    for pair in np.unique(pairs, axis=0):
+    ordered, start = np.unique(pairs, axis=0, return_index=True)
+    for pair, along in zip(ordered, np.split(at, start[1:]), strict=False):
         first, second = (tiles[k] for k in pair)
         if first is None or second is None:
             continue
@@ -128,7 +129,7 @@ def measure_seams(
             if k not in searchable:
                 searchable[k] = _searchable(tile.inside)
         areas1, areas2 = (searchable[k] for k in pair.tolist())
-        here, reaches = _comparable_places((first, areas1), (second, areas2), at[(pairs == pair).all(axis=1)])
+        here, reaches = _comparable_places((first, areas1), (second, areas2), along)
         near_border = _on_border(labels, label_size, pair)
         verdicts = _verdicts(first, second, np.rint(here).astype(np.intp), reaches, near_border, CONTRAST * full)
         found += [(pair, place, verdict) for place, verdict in zip(here, verdicts, strict=True) if verdict is not None]
@@ -141,7 +142,7 @@ def measure_seams(
 
 
 def _border_places(labels: NDArray[np.int32], label_size: float) -> tuple[IntArray, FloatArray]:
-    """Pairs of owners (N, 2), the smaller first, and places of their borders (N, 2) on the canvas of the tiles."""
+    """Pairs of owners (N, 2), ascending, and places of their borders (N, 2) on the canvas of the tiles."""
     found = []
     for first, second, right, down in ((labels[:, :-1], labels[:, 1:], 0.5, 0.0), (labels[:-1], labels[1:], 0.0, 0.5)):
         y, x = np.nonzero((first != second) & (first >= 0) & (second >= 0))
@@ -309,8 +310,7 @@ def _breaks(
     graph = sparse.coo_array((np.ones(len(one)), (one, two)), shape=(len(at),) * 2)
     _, group = csgraph.connected_components(graph, directed=False)
     breaks = []
-    for k in range(int(group.max()) + 1):
-        members = group == k
+    for members in np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1]):
         length = float(np.hypot(*np.ptp(at[members], axis=0))) + _STEP
         middle = at[members][np.argmin(np.hypot(*(at[members] - at[members].mean(axis=0)).T))]
         known = size[chosen][members]
