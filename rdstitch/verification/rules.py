@@ -182,8 +182,10 @@ def _inputs(evidence: ResultEvidence) -> Iterator[Finding]:
     sources = evidence.registration.sources
     headers = [(k, source.metadata) for k, source in enumerate(sources)]
     bodies: dict[str, list[int]] = {}
+    numbered = {(header.make, header.model) for _, header in headers if header.serial}
     for k, header in headers:
-        if header.model or header.serial:
+        # A program that edits an image often leaves its serial number out: one without may be any of its model.
+        if header.serial or (header.model and (header.make, header.model) not in numbered):
             bodies.setdefault(" ".join(filter(None, (header.make, header.model, header.serial))), []).append(k)
     focal = {k: header.focal_px / max(header.size) for k, header in headers if header.focal_px is not None}
     if len(bodies) > 1:

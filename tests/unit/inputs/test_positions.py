@@ -212,7 +212,6 @@ def test_control_points(tmp_path: Path) -> None:
     [
         "# x, y, z, px, py, image\n500000 5300000 5 30 20 a.jpg",
         "# x, y, z, px, py, image\n500000 5300000 5 30,0 20 a.jpg\n500010,5 5300000 5 1,125 20 elsewhere, b.jpg",
-        "# image, name\n500000 5300000 5 30 20 a.jpg\n",
         "500000\t5300000\t5\t30\t20\ta.jpg",
         "# x;y;px;py;image\n500000;5300000;30;20;a.jpg",
     ],

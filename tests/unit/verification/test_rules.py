@@ -207,7 +207,7 @@ def _texts(*sources: Source) -> list[str]:
     return [message.text for message in messages_of(rules._inputs(evidence(given)), given)]
 
 
-@pytest.mark.parametrize("other", [{"model": "B"}, {"model": "A", "serial": "2"}, {"make": "X", "model": "A"}])
+@pytest.mark.parametrize("other", [{"model": "B"}, {"model": "B", "serial": "1"}, {"make": "X", "model": "A"}])
 def test_several_cameras_are_named_the_commonest_first(other: dict[str, Any]) -> None:
     (text,) = _texts(source("z.jpg", **other), *(source(f"{k}.jpg", model="A") for k in range(2)))
     assert text.startswith("the images come from 2 cameras: A (2: 0.jpg, 1.jpg); ")
@@ -215,7 +215,11 @@ def test_several_cameras_are_named_the_commonest_first(other: dict[str, Any]) ->
 
 
 def test_images_of_one_camera_are_fine_a_serial_number_is_enough_and_no_header_is_no_camera() -> None:
-    assert _texts(*(source(f"{k}.jpg", model="A", serial="1", focal_px=900.0) for k in range(3))) == []
+    one = [source(f"{k}.jpg", model="A", serial="1", focal_px=900.0) for k in range(3)]
+    edited = source("edited.jpg", model="A")
+    assert _texts(*one) == _texts(*one, edited) == []
+    (text,) = _texts(*one, edited, source("other.jpg", model="A", serial="2"))
+    assert text.startswith("the images come from 2 cameras: A 1 (3: 0.jpg, 1.jpg, 2.jpg); A 2 (1: other.jpg); ")
     assert _texts(source("a"), source("b")) == _texts() == []
     assert len(_texts(source("a", serial="1"), source("b", serial="2"))) == 1
     assert _texts(source("a", serial="1"), source("b", make="X")) == []
