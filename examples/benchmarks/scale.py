@@ -2,9 +2,10 @@
 
 A drone's survey of 480 x 360 frames, or of another ``--size``, one lane beside the other, is rendered frame by frame
 into a temporary folder (60 kB a frame) and stitched by one worker, or ``--workers``, in a process of its own. Printed
-are processor time and peak memory by stage, the error of λ, and the median and largest position error of the frames,
-also as a share of the path; and seconds of the main thread, and their share: with two workers or more, what no further
-one shortens, and the encoder, which works beside them. Times depend on the machine: only those of one run compare.
+are processor time and peak memory by stage; the error of λ; the median error of frames against those beside them, and
+the median and largest of their positions after the best similarity of all, also as a share of the path; and seconds of
+the main thread, and their share: with two workers or more, what no further one shortens, and the encoder, which works
+beside them. Times depend on the machine: only those of one run compare.
 
 ``--drawn``: matches are drawn instead of found, and nothing is composited, so that alignment, loop closure, checks by
 matches and local alignment of 10,000 frames take minutes.
@@ -24,6 +25,8 @@ from examples.benchmarks.drawn_matches import DrawnMatches
 from examples.benchmarks.driver import StagePeaks, StageTimes, apart, costliest, processor_time, run
 from examples.judging import registration_error
 from examples.worlds.paths import survey_poses
+from rdstitch.alignment import Alignment
+from rdstitch.arrays import evenly_spaced
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
@@ -38,7 +41,7 @@ from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.registration import Registration
 from rdstitch.synthetic import Photometry, Sequence, blank, ground, sequence_over
 from rdstitch.system.cache import Cache
-from rdstitch.system.process_memory import forget_peak_memory
+from rdstitch.system.process_memory import forget_peak_memory, take_over_memory
 from rdstitch.system.progress import Progress
 from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.verdict import failures_of_matches
@@ -48,6 +51,7 @@ DISTORTION = -0.25
 SIZE = "480x360"
 _SEED = 19
 _GRID = (5, 4)  # points of a frame at which its place is compared
+_LINKS = 2000  # of which the error of one frame against the other is taken
 
 
 def survey(count: int, size: str = SIZE, *, rendered: bool = True) -> Sequence:
@@ -85,6 +89,7 @@ def measure(
     matches = DrawnMatches(sequence, progress=lambda *_: note(next(drafts, "closing loops"), 1, 1))
     pairs = matches.first() if drawn else []
     stages, serial, peaks, before = StageTimes(), StageTimes(thread_time), StagePeaks(), processor_time()
+    take_over_memory()  # as the command does
     forget_peak_memory()
     options = rdstitch.StitchOptions(workers=workers, overwrite=True, force=True)
     if drawn:
@@ -107,6 +112,7 @@ def measure(
         "used": int(alignment.used.sum()),
         "pairs": len(registration.pairs),
         "distortion": alignment.distortion,
+        "local": local_error(alignment, sequence, order),
         "largest": error.max,
         "median": error.median,
         "path": path,
@@ -114,6 +120,18 @@ def measure(
         "serial": serial.spent,
         "peaks": peaks.held,
     }
+
+
+def local_error(alignment: Alignment, sequence: Sequence, order: list[int]) -> float:
+    """Median distance, pixels, from where the alignment transfers points of a frame to, to where another shows them."""
+    size, links = np.array(sequence.lens.image_size), list(alignment.support)
+    grid = np.stack(np.meshgrid(*(np.linspace(0.0, 1.0, n) for n in _GRID)), axis=-1).reshape(-1, 2) * (size - 1.0)
+    errors = []
+    for i, j in (links[k] for k in evenly_spaced(len(links), _LINKS)):
+        seen = sequence.to_image(order[j], sequence.to_plane(order[i], grid))
+        inside = ((seen >= 0.0) & (seen < size)).all(axis=1)
+        errors.append(np.linalg.norm(alignment.transfer(i, j, grid) - seen, axis=1)[inside])
+    return float(np.median(np.concatenate(errors)))
 
 
 def aligned_by_drawn(
@@ -151,7 +169,11 @@ def print_row(row: dict[str, Any], first: dict[str, Any]) -> None:
     growth = (row["memory"] - first["memory"]) / max(count - first["count"], 1)
     line += f"{growth:10.2f}" if row is not first else f"{'':10s}"
     line += f"{row['used']:8d}{row['pairs'] / count:10.1f}{row['distortion'] - DISTORTION:11.6f}"
-    print(line + f"{row['median']:9.3f}{row['largest']:9.3f}{100 * row['largest'] / row['path']:10.4f}", flush=True)
+    print(
+        line
+        + f"{row['local']:9.3f}{row['median']:9.3f}{row['largest']:9.3f}{100 * row['largest'] / row['path']:10.4f}",
+        flush=True,
+    )
     for unit, values in (
         ("ms/frame", {stage: 1e3 * taken / count for stage, taken in row["stages"].items()}),
         ("MB", row["peaks"]),
@@ -175,8 +197,21 @@ def main(
         sequence, order = survey(counts[0], size, rendered=False), frame_order(counts[0], shuffled)
         print(json.dumps(measure(folder, sequence, order, workers, register_only=register, drawn=drawn)))
         return
-    columns = ("s", "ms/frame", "ratio", "MB", "MB/frame", "used", "pairs/fr.", "Δλ", "median", "largest", "% of path")
-    widths = (10, 10, 8, 10, 10, 8, 10, 11, 9, 9, 10)
+    columns = (
+        "s",
+        "ms/frame",
+        "ratio",
+        "MB",
+        "MB/frame",
+        "used",
+        "pairs/fr.",
+        "Δλ",
+        "local",
+        "median",
+        "largest",
+        "% of path",
+    )
+    widths = (10, 10, 8, 10, 10, 8, 10, 11, 9, 9, 9, 10)
     print(f"{'frames':>8}" + "".join(f"{name:>{width}}" for name, width in zip(columns, widths, strict=True)))
     first: dict[str, Any] | None = None
     for count in counts:

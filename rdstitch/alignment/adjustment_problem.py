@@ -43,6 +43,11 @@ class Fit:
     # of the errors that it leaves, at least that of the problem; see BundleAdjuster
     overdispersion: float = 1.0
 
+    @property
+    def bare(self) -> Self:
+        """See :attr:`BundleAdjustmentResult.bare`."""
+        return replace(self, adjusted=self.adjusted.bare)
+
 
 @dataclass(frozen=True)
 class _Scales:

@@ -61,7 +61,7 @@ class AlignmentTask(GivenImages):
     @cached_property
     def draft(self) -> Alignment:
         """Model, lens and poses by a few matches of each link; deviations are those of the normal equations."""
-        return build_alignment(self._selected)
+        return build_alignment(replace(self._selected))  # what is computed for it alone is not kept
 
     @cached_property
     def result(self) -> Alignment:
@@ -81,8 +81,8 @@ def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
     if problem.reference in full:
         return problem.reference
     observed = problem.observations
-    trust = [float(problem.trust[(observed.image1 == k) | (observed.image2 == k)].sum()) for k in full]
-    return int(full[np.argmax(trust)])
+    trust = sum(np.bincount(images, problem.trust, len(size)) for images in (observed.image1, observed.image2))
+    return int(full[np.argmax(np.asarray(trust)[full])])
 
 
 def _lens_and_model(given: GivenImages) -> AdjustedImages:
@@ -106,8 +106,7 @@ def _lens_and_model(given: GivenImages) -> AdjustedImages:
         all_links = replace(all_links, camera_priors=options.camera_priors(given.cameras).with_lens(distortion))
         connected, _ = all_links.part(~wrong)
     choice = select_model(connected, options.models, lens.refinements, options.purpose)
-    choice, images, wrong = _drop_wrong_pairs(all_links, images, choice, wrong)
-    aligned, _ = all_links.part(~wrong, images)
+    aligned, choice, images, wrong = _drop_wrong_pairs(all_links, connected, images, choice, wrong)
     choice = choose_over_relief(aligned, choice, options.models, options.purpose)
     if options.reference is not None and options.reference not in images:
         messages.append(REFERENCE_LEFT_OUT)
@@ -118,8 +117,8 @@ def _lens_and_model(given: GivenImages) -> AdjustedImages:
         ~wrong,
         replace(all_links, observations=all_matches, free_lens=free, min_gain=MIN_GAIN),
         replace(aligned, free_lens=free),
-        choice,
-        lens.refined(free),
+        replace(choice, fit=choice.fit.bare),
+        replace(lens.refined(free), pairwise=lens.pairwise.bare),
         messages=tuple(messages),
     )
 
@@ -152,7 +151,9 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
         # Few images of a turn hardly determine the focal length; all their matches are used.
         every, _ = _observations(links, chosen.given.cameras, _MATCHES_OF_A_TURN // len(links))
         all_links = replace(all_links, observations=every)
-    problem, _ = all_links.part(chosen.kept_links, chosen.images)
+    problem = replace(chosen.problem, min_gain=all_links.min_gain)
+    if all_links.observations.most > problem.observations.most:  # matches that were not looked at yet
+        problem, _ = all_links.part(chosen.kept_links, chosen.images)
     # What errors share weighs the more, the more of them there are.
     shared, _ = independent_errors(problem.observations, problem.homographies, problem.lens)
     problem = replace(problem, overdispersion=max(shared, choice.fit.overdispersion))
@@ -252,10 +253,10 @@ def _tree_ranks(observations: Observations, confirmed: IntArray) -> FloatArray:
 
 
 def _drop_wrong_pairs(
-    all_links: Problem, images: IntArray, choice: ModelChoice, wrong: BoolArray
-) -> tuple[ModelChoice, IntArray, BoolArray]:
-    """Test all links against the adjusted poses, and adjust again without those that do not fit."""
-    all_links = replace(all_links, free_lens=choice.fit.free_lens)
+    all_links: Problem, problem: Problem, images: IntArray, choice: ModelChoice, wrong: BoolArray
+) -> tuple[Problem, ModelChoice, IntArray, BoolArray]:
+    """Test all links against the adjusted poses, and adjust the problem again without those that do not fit."""
+    as_given, all_links = all_links.free_lens, replace(all_links, free_lens=choice.fit.free_lens)
     o = all_links.observations
     for _ in range(_ROUNDS):
         adjusted, model = choice.fit.adjusted, choice.fit.model
@@ -276,4 +277,4 @@ def _drop_wrong_pairs(
         else:
             fit = fit_model(problem, model)
         choice, images = replace(choice, fit=fit), kept
-    return choice, images, wrong
+    return replace(problem, free_lens=as_given), choice, images, wrong

@@ -74,9 +74,10 @@ def sandwich_covariances(
     errors = 2 * int((response.weight > 0.0).sum())
     absorbed = errors / max(errors - count, 0.25 * errors)
     noise = absorbed * _by_keypoints(observations, influence)
+    information = response.normal.shared_information()
+    del response, influence  # which take as much memory as what follows
     by_relief = _relief(adjuster, adjusted).steps()[1]
     correlated = _at_least(priors + noise + by_relief @ by_relief.T, by_images)
-    information = response.normal.shared_information()
     independent = replace(adjuster, overdispersion=1.0).normal_equations(adjusted).shared_information()
     derivative = adjuster.named_parameters(adjusted.parameters.shared)[1]
     result = []

@@ -98,7 +98,12 @@ class BundleAdjustmentResult:
         """Of each correspondence (M, 2), pixels, whitened; NaN where it cannot be transferred."""
         return whitened_errors(self.adjuster.observations, self.homographies, self.parameters.lens)
 
-    @cached_property
+    @property
+    def bare(self) -> Self:
+        """The same without errors and matrices, which take more memory than the rest; they can be computed again."""
+        return replace(self)
+
+    @property
     def squared(self) -> FloatArray:
         """``|r|²`` of each correspondence (M,), px²; inf where it cannot be transferred."""
         return squared_lengths(self.errors)

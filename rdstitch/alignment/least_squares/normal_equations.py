@@ -19,7 +19,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.system.late_imports import sparse
 
-_LINKS_AT_ONCE = 4096
+_LINKS_AT_ONCE = 1024
 """Whose dense blocks are made at a time: those of all links would be most of an alignment's memory."""
 
 

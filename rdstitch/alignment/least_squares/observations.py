@@ -57,6 +57,11 @@ class Observations:
         """Number of links."""
         return len(self.image1)
 
+    @property
+    def most(self) -> int:
+        """Correspondences of the link that has the most."""
+        return int(np.diff(self.start).max(initial=0))
+
     @cached_property
     def link(self) -> IntArray:
         """The link of each correspondence, shape (M,)."""
@@ -134,5 +139,7 @@ class Observations:
 
     def thinned(self, most: int) -> Self:
         """Of each link at most about ``most`` correspondences, well spread over its overlap."""
+        if self.most <= most:
+            return self
         kept = [spread_choice(self.points1[a:b], most) + a for a, b in itertools.pairwise(self.start)]
         return self.rows(np.concatenate([np.empty(0, dtype=np.intp), *kept]), np.array([len(k) for k in kept]))
