@@ -106,7 +106,7 @@ class Posterior:
         wide = 4.0 * self.problem.count * math.log(max(spread, 1.0))
         priors = self.problem.adjuster_of(fit).camera_prior_cost(fit.adjusted.parameters)
         score = self.lower_bound(fit.model, fit.adjusted.errors, fit.free_lens) + wide + priors
-        return Hypothesis(fit.bare, score, field, layout)
+        return Hypothesis(fit, score, field, layout)
 
     def lower_bound(self, model: MotionModel, errors: FloatArray, free_lens: BoolArray | None = None) -> float:
         """The score of a model that leaves such errors (M, 2), of a camera that is as cameras are."""

@@ -72,10 +72,12 @@ class Vocabulary:
         """Number of words."""
         return len(self.branches) ** 2
 
-    def assign(self, descriptors: Array32) -> IntArray:
+    def assign(self, descriptors: Array32) -> NDArray[np.int32]:
         """The word of each descriptor, shape (M,)."""
+        word = np.empty(len(descriptors), dtype=np.int32)
+        if not len(descriptors):
+            return word
         branch = _nearest(descriptors, self.branches)
-        word = np.empty(len(descriptors), dtype=np.intp)
         order = np.argsort(branch, kind="stable")
         edges = np.searchsorted(branch[order], np.arange(len(self.branches) + 1))
         for k in np.flatnonzero(np.diff(edges)).tolist():
@@ -101,10 +103,10 @@ def similarity(features: FeatureStore, seed: int) -> Similarity | None:
     parts = np.split(chosen, np.searchsorted(chosen, starts[1:]))
     vocabulary = Vocabulary.learned(_training(features, parts, starts), branches, random)
     described = (_describing(of_image) for of_image in features)
-    words = [vocabulary.assign(of_image) if len(of_image) else np.empty(0, np.intp) for of_image in described]
-    image, word = np.repeat(np.arange(len(counts)), counts), np.concatenate(words)
-    ones = np.ones(total, dtype=np.float32)
-    used = sparse.coo_array((ones, (image, word)), shape=(len(counts), vocabulary.size)).tocsr()
+    words = np.concatenate([vocabulary.assign(of_image) for of_image in described])
+    shape = len(counts), vocabulary.size
+    used = sparse.csr_array((np.ones(total, dtype=np.float32), words, np.append(starts, total)), shape)
+    used.sum_duplicates()
     rarity = np.log(len(counts) / np.maximum(np.bincount(used.indices, minlength=vocabulary.size), 1))
     weighted = (used @ sparse.diags_array(rarity.astype(np.float32))).tocsr()
     return _compare(_unit_rows(weighted))
