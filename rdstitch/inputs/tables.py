@@ -45,9 +45,6 @@ _NOTATIONS = {
 }
 _GROUPED = re.compile(r"(?<=\d)[\s'’](?=\d{3}(?!\d))")
 NUMERAL = re.compile(r"[-+\u2212]?[.,]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+)?")
-_TWO_NUMERALS = re.compile(rf"(?<!\S){NUMERAL.pattern} +{NUMERAL.pattern}(?!\S)")  # of a list, not of a table
-# Numbers, or words, that follow a file's ending.
-_BEHIND_A_NAME = re.compile(rf"\.[A-Za-z]\w+\s+({_TWO_NUMERALS.pattern}|(?!.*(\.[A-Za-z]\w+$|[\\/])))")
 _NO_UNITS = MappingProxyType[str, str]({})
 
 
@@ -141,15 +138,25 @@ def csv_rows(
         raise InputError(f"{file}: line {reader.line_num + start}: is not CSV: {error}") from error
     if not rows:
         raise InputError(f"{file}: has no rows below its heading")
-    return _rows(rows, known)
+    return rows_of(rows, known)
 
 
-def is_table(text: str, file: str, columns: Mapping[str, str], units: Mapping[str, str] = _NO_UNITS) -> bool:
-    """Whether it is what :func:`csv_rows` reads, not a list, above which a comment may name columns too."""
+def is_table(
+    text: str,
+    file: str,
+    columns: Mapping[str, str],
+    is_listed: Callable[[str], object],
+    units: Mapping[str, str] = _NO_UNITS,
+) -> bool:
+    """Whether it is what :func:`csv_rows` reads, not a list, above which a comment may name columns too.
+
+    ``is_listed`` tells a line of the list, which may hold decimal commas.
+    """
     known = _finder(file, columns, units)
     heading = next((line for line in text.splitlines() if _is_heading(line, known)), "")
     first = next((line for _, line in numbered_lines(text, file)), "")
-    return _names_columns(heading, known) and _delimiter(heading) in first and not _TWO_NUMERALS.search(first)
+    delimiter = _delimiter(heading)
+    return _names_columns(heading, known) and delimiter in first and (delimiter == "\t" or not is_listed(first))
 
 
 def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> list[Row]:
@@ -158,7 +165,7 @@ def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> 
     if not isinstance(content, list) or not all(isinstance(item, dict) for item in content):
         raise InputError(f"{file}: expected {wanted}")
     rows = ((f"{file}: [{number}]", item.items()) for number, item in enumerate(content))
-    return _rows(rows, _finder(file, columns, _NO_UNITS))
+    return rows_of(rows, _finder(file, columns, _NO_UNITS))
 
 
 def numbered_lines(text: str, file: str) -> list[tuple[str, str]]:
@@ -167,27 +174,14 @@ def numbered_lines(text: str, file: str) -> list[tuple[str, str]]:
     return [(where, line) for where, line in lines if line and not line.startswith("#")]
 
 
-def listed_rows(text: str, file: str, columns: Sequence[str]) -> list[Row]:
-    """Lines of a name, which may hold blanks, two numbers or more, and other words; see :func:`numbered_lines`."""
-    rows = []
-    for where, line in numbered_lines(text, file):
-        fields = line.split()
-        found = ((end, _numbers_before_words(fields[end : end + len(columns) - 1])) for end in range(1, len(fields)))
-        end, numbers = next(((end, numbers) for end, numbers in found if numbers), (1, []))
-        name = line.rsplit(maxsplit=len(fields) - end)[0]
-        if not numbers or _BEHIND_A_NAME.search(name):
-            raise InputError(f"{where}: expected a name and numbers between blanks, not '{line}'")
-        rows.append((where, zip(columns, (name, *numbers), strict=False)))
-    return _rows(rows, str)
+def numbers_before(fields: Sequence[str]) -> list[str]:
+    """Those of the fields before the first that is no number, nor an empty one."""
+    return list(takewhile(lambda field: _readings(field) or field.lower() in _EMPTY, fields))
 
 
-def _numbers_before_words(fields: Sequence[str]) -> list[str]:
-    """The numbers that the fields begin with, where they are two or more and no word behind them begins like one."""
-    numbers = list(takewhile(lambda field: _readings(field) or field.lower() in _EMPTY, fields))
-    return [] if len(numbers) < 2 or any(map(NUMERAL.match, fields[len(numbers) :])) else numbers
-
-
-def _rows(found: Iterable[tuple[str, Iterable[tuple[str, Any]]]], column_of: Callable[[str], str | None]) -> list[Row]:
+def rows_of(
+    found: Iterable[tuple[str, Iterable[tuple[str, Any]]]], column_of: Callable[[str], str | None] = str
+) -> list[Row]:
     """Rows of cells with their headings, with the decimal mark that their unambiguous numbers share."""
     rows = []
     for where, cells in found:
