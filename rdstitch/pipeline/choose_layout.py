@@ -182,8 +182,7 @@ def _other_models(
         by_name = replace(aligner, options=replace(aligner.options, model=name))
         other = realigned(registration, by_name, partial(_differs, registration, allowed, stretched=stretched))
         if other is not None and _joins(other, registration, allowed):
-            reason = f"{other.alignment.model_reason.removesuffix('; as requested')}; seams break less than with a "
-            reason += f"{alignment.model} model"
+            reason = f"seams break less than with a {alignment.model} model"
             yield replace(other, alignment=replace(other.alignment, model_reason=reason))
 
 
