@@ -56,7 +56,7 @@ def divisor_slope(radius2: FloatArray, distortion: ArrayLike, higher: Sequence[f
 
 
 def undistort(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
-    """Undistort normalized points (..., 2), from the centre; λ broadcasts, but is one number beside ``higher``, μ and ν.
+    """Undistort normalized points (..., 2); λ broadcasts, but is one number where there are μ and ν, ``higher``.
 
     NaN outside the domain: where ``g`` is not positive, and beyond the radius at which the undistorted one stops
     growing.

@@ -85,7 +85,7 @@ def mosaic_bands(
         run = replace(run, options=whole, read=[*run.read, *listed.files])
         of_first = replace(listed, frames=chosen[0])
         first = stitch_found(of_first, run, outputs, more_images=files[1:], more_files=stack)
-        saved = replace(read_sidecar(_staged(outputs, f"{files[0]}.json")), path=Path(f"{files[0]}.json"))
+        saved = replace(read_sidecar(outputs.where(f"{files[0]}.json")), path=Path(f"{files[0]}.json"))
         same = ApplyOptions(
             mask=options.mask,
             overwrite=options.overwrite,
