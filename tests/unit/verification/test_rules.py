@@ -236,6 +236,27 @@ def test_a_lens_that_was_zoomed_is_noticed(focal: float, zoomed: bool) -> None:
         assert f"by up to {ratio:.2f} (between {near} and {far})" in found[0]
 
 
+@pytest.mark.parametrize(
+    ("size", "focal_px", "focal_mm", "zoomed"),
+    [
+        ((4000, 2250), 2546.0, 8.8, False),  # crops whose tag of 35 mm, 24, was left as it is
+        ((3000, 3000), 2353.0, 8.8, False),
+        ((2000, 1500), 1387.0, 12.8, True),
+        ((4000, 3000), 5547.0, 8.8, True),  # by the camera's program
+        ((3000, 4000), 3200.0, None, True),
+        ((4000, 2250), 3200.0, None, False),  # a crop, or not: nobody knows
+    ],
+)
+def test_a_crop_is_no_zoom(size: tuple[int, int], focal_px: float, focal_mm: float | None, zoomed: bool) -> None:
+    first, second = (
+        source("a.jpg", focal_px=2773.0, focal_mm=8.8),
+        source("b.jpg", focal_px=focal_px, focal_mm=focal_mm),
+    )
+    headers = replace(first.metadata, size=(4000, 3000)), replace(second.metadata, size=size)
+    sources = [replace(each, metadata=header) for each, header in zip((first, second), headers, strict=True)]
+    assert bool(_texts(*sources)) is zoomed
+
+
 def test_images_without_a_mask_among_others_are_named() -> None:
     masked = [source(f"{k}.png", mask=Mask(Path("m"))) for k in range(3)]
     assert _texts(*masked) == []
