@@ -78,12 +78,12 @@ def report_page(
     command: str = "",
     image: Path | None = None,
 ) -> str:
-    """The report as HTML; see :func:`write_report`. ``image`` is where the image lies now."""
+    """The report as HTML; see :func:`write_report`. ``image`` is where the image lies until it is published."""
     registration = result.registration if isinstance(result, StitchResult) else result
     title, output = "rdstitch report", list[str]()
     if isinstance(result, StitchResult):
         title = title if result.output is None else result.output.name
-        output = [mosaic_section(result, image), place_section(result), local_alignment(result)]
+        output = [mosaic_section(result, image or result.output), place_section(result), local_alignment(result)]
     body: list[Content] = [
         summary(result),
         notices(registration),
