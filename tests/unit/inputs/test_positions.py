@@ -140,12 +140,16 @@ def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> N
     assert three is None
     shifted = _read(tmp_path, GPX, offset=-20.0)
     assert [place is not None for place in shifted] == [False, True, True]
+    # A waypoint is no point of the track.
+    waypoint = '<wpt lat="46" lon="7"><time>2023-11-14T22:13:20Z</time></wpt>'
+    assert _read(tmp_path, GPX.replace("<trk>", f"{waypoint}<trk>")) == [one, two, three]
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "names no columns like name,latitude,longitude or name,x,y"),
+        ("name,lat,lon\n", "has no rows below its heading"),
         ("name,lat,lon\nz.jpg,1,2\n", "has no position of a.jpg"),
         ("name,lat,lon\na.jpg,1,2\na.jpg,1,2\n", "line 3: a.jpg is here twice"),
         ("name,lat,lon\na.jpg,91,2\n", "line 2: expected latitude and longitude in degrees, not 91 and 2"),
@@ -168,10 +172,16 @@ def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> N
             "line 2: expected a latitude like 33.85, -33.85 or 33 51 S",
         ),
         ("name,lat,lon\na.jpg,33.85 S,5 O\n", "line 2: expected a longitude like"),
+        ("name;lat;lon\na.jpg;33 75 00 S;5 E\n", "line 2: expected a latitude like"),
+        ("name;lat;lon\na.jpg;33 51 60 S;5 E\n", "line 2: expected a latitude like"),
+        ("name;lat;lon\na.jpg;48.5 30 N;5 E\n", "line 2: expected a latitude like"),
+        ("name;lat;lon\na.jpg;48 51 29 6 N;5 E\n", "line 2: expected a latitude like"),
+        ("name;lat;lon\na.jpg;48.8584, 2.2945;5 E\n", "line 2: expected a latitude like"),
         ("name,lat,lon\na.jpg,48,8582,2,2945\n", "line 2: has 5 fields"),
         ("name,lat,lon\na.jpg,1,2\nb.jpg,oops,2\n", "line 3: expected a number for latitude, not 'oops'"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg oops 5e6\n", "line 3: expected a name and numbers between blanks, not 'b"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 500000m 5e6 100 0\n", "line 3: expected a name and numbers between blanks"),
+        ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 5e5 5e6 w/o 5 6\n", "line 3: expected a name and numbers between blanks"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg x y w/o 5 6\n", "line 3: expected a name and numbers between blanks"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 5e5 oops 100\n", "line 3: expected a name and numbers between blanks"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 5e5 5e6 1OO 0\n", "line 3: expected a name and numbers between blanks"),
@@ -208,18 +218,32 @@ def test_control_points(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "lines",
+    ("lines", "name"),
     [
-        "# x, y, z, px, py, image\n500000 5300000 5 30 20 a.jpg",
-        "# x, y, z, px, py, image\n500000 5300000 5 30,0 20 a.jpg\n500010,5 5300000 5 1,125 20 elsewhere, b.jpg",
-        "500000\t5300000\t5\t30\t20\ta.jpg",
-        "# x;y;px;py;image\n500000;5300000;30;20;a.jpg",
+        ("# x, y, z, px, py, image\n500000 5300000 5 30 20 a.jpg", "500000 5300000"),
+        (
+            "# x, y, z, px, py, image\n500000 5300000 5 30,0 20 a.jpg\n500010,5 5300000 5 1,125 20 elsewhere, b.jpg",
+            "500000 5300000",
+        ),
+        ("# x, y, z of Bob\n500000 5300000 5 30 20 a.jpg corner, NE", "corner, NE"),
+        ("500000\t5300000\t5\t30\t20\ta.jpg", "500000 5300000"),
+        ("# x;y;px;py;image\n500000;5300000;30;20;a.jpg", "500000 5300000"),
     ],
 )
-def test_a_list_of_control_points_is_told_from_a_table(tmp_path: Path, lines: str) -> None:
+def test_a_list_of_control_points_is_told_from_a_table(tmp_path: Path, lines: str, name: str) -> None:
     (tmp_path / "gcp").write_text(f"EPSG:32632\n{lines}\n", encoding="utf-8")
     (point,) = with_ground_control(_sources(), tmp_path / "gcp")[0].control
-    assert (point.name, point.pixel) == ("500000 5300000", (30.0, 20.0))
+    assert (point.name, point.pixel) == (name, (30.0, 20.0))
+
+
+def test_latitude_and_longitude_are_what_they_are_whatever_system_a_list_names(tmp_path: Path) -> None:
+    rows = "image,latitude,longitude,px,py,label\na.jpg,46.2,7.1,30,20,1\nb.jpg,46 12 0 N,7.1,30,20,2\n"
+    (tmp_path / "gcp").write_text(f"EPSG:32632\n{rows}", encoding="utf-8")
+    one, two, _ = (source.control for source in with_ground_control(_sources(), tmp_path / "gcp"))
+    assert [(c.place.latitude, c.place.longitude, c.epsg) for c in (*one, *two)] == [(46.2, 7.1, 4326)] * 2
+    (tmp_path / "gcp").write_text(f"{rows}c.jpg,,7.1,30,20,3\n", encoding="utf-8")
+    with pytest.raises(InputError, match="line 4: has no coordinates"):
+        with_ground_control(_sources(), tmp_path / "gcp")
 
 
 def test_projected_numbers_in_other_notations_and_zero_longitude(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ COLUMNS = {"name": "name file image", "x": "x easting", "y": "y northing", "um":
 
 
 def _rows(text: str) -> list[Row]:
-    return csv_rows(text, "t.csv", COLUMNS, ("name,x,y", "name,um"), ("m",))
+    return csv_rows(text, "t.csv", COLUMNS, ("name,x,y", "name,um"), {"x": "m", "y": "mm"})
 
 
 @pytest.mark.parametrize(
@@ -61,6 +61,10 @@ def test_headings_quotes_comments_and_paths() -> None:
         ("", "t.csv: its first line names no columns like name,x,y or name,um"),
         ("name,x\na,1\n", "names no columns like"),
         ("name,x (ft),y\na,1,2\n", "t.csv: the column 'x (ft)' has a unit that is not known here; give it in m"),
+        ("name,x (mm),y\na,1,2\n", "t.csv: the column 'x (mm)' has a unit that is not known here; give it in m"),
+        ("name,x1,y1,x2,y2\na,1,2,3,4\n", "names no columns like"),
+        ("name,x,easting,y\na,1,1.0,2\na,1,3,2\n", "line 3: has two numbers for x, 1 and 3; remove one of the columns"),
+        ("name,x,y\n\n", "t.csv: has no rows below its heading"),
         ("name,x,y\n\na,48,8582,2,2945\n", "t.csv: line 3: has 5 fields, but there are 3 columns"),
         ('name,x,y\na,"1,2\n', "t.csv: line 2: is not CSV"),
         ("n\0a\0m\0e\0", "t.csv: is not UTF-8 text"),
