@@ -11,16 +11,20 @@ import numpy as np
 from examples.worlds.alignment_scenes import grid, scene
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.choices import Purpose
+from rdstitch.compositing import plan_canvas
 from rdstitch.executors import open_executor
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.mask import Mask
 from rdstitch.io.metadata import Metadata
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.register import register
 from rdstitch.pipeline.run import Run
+from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.registration import Registration
+from rdstitch.results.stitch_result import StitchResult
 from rdstitch.verification.evidence import ResultEvidence
 
 CAMERA = Camera((400, 300))
@@ -50,6 +54,13 @@ def registration(
     sources = [source(f"{name}.jpg") for name in "abcdef"[:images]] if isinstance(images, int) else images
     found = replace(_aligned(max(2, len(sources))), **alignment)
     return Registration(tuple(sources), tuple(keypoints), tuple(pairs), found, (), mixed=mixed)
+
+
+def stitched(given: Registration, output: Path | None = None, **composite: Any) -> StitchResult:
+    """With its canvas, as if its image had been written."""
+    placed, options = PlacedImages.of(given, None), StitchOptions(composite=CompositeOptions(**composite))
+    canvas = plan_canvas(placed.cameras, placed.homographies)
+    return StitchResult(registration=given, placed=placed, canvas=canvas, options=options, output=output)
 
 
 def registered(frames: Sequence[Path], options: StitchOptions, focal: float | None = 380.0) -> Registration:

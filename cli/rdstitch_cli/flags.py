@@ -30,7 +30,7 @@ def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callab
     def make(function: Callable[..., Any]) -> click.Command:
         @wraps(function)
         def run(*, quiet: bool, verbose: bool, **given: Any) -> Any:
-            _check_not_read([given[name] for name in written if given[name] is not None], given.get("camera"))
+            _check_not_read(flags, given)
             try:
                 with Reporter(verbose - quiet) as reporter:
                     return function(reporter=reporter, **given)
@@ -53,7 +53,7 @@ def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callab
             click.Option(["-v", "--verbose"], is_flag=True, help="Print details."),
             config,
         ]
-        written = [option.name for option in parameters if isinstance(option, Flag) and option.writes]
+        flags = [option for option in parameters if isinstance(option, Flag)]
         epilog = f"\b\nExamples:{examples}\n\n{EXIT_STATUSES}"
         return GroupedCommand(function.__name__, callback=run, params=parameters, help=function.__doc__, epilog=epilog)
 
@@ -91,7 +91,7 @@ def _flag(entry: Declared, default: Any) -> click.Option:
     shown = how.pop("shown", plain)
     shown = option.default or shown
     text = option.text + f"  [default: {shown}]" * bool(shown)
-    return Flag(names, metavar=option.metavar or None, help=text, writes=option.writes, **how)
+    return Flag(names, metavar=option.metavar or None, help=text, declared=option, **how)
 
 
 def _is_unset(default: Any) -> bool:
@@ -127,19 +127,23 @@ _KINDS: dict[Any, Callable[[Declared, Any], dict[str, Any]]] = {
 
 
 class Flag(click.Option):
-    """An option that knows whether it names what is written."""
+    """An option with what is declared of it."""
 
-    def __init__(self, *arguments: Any, writes: bool, **given: Any) -> None:
+    def __init__(self, *arguments: Any, declared: Option, **given: Any) -> None:
         super().__init__(*arguments, **given)
-        self.writes = writes
+        self.declared = declared
 
 
-def _check_not_read(written: Iterable[Path], camera: Path | None) -> None:
-    """Refuse to write over the camera file that is read, or over the configuration."""
+def _check_not_read(flags: Iterable[Flag], given: Mapping[str, Any]) -> None:
+    """Refuse to write over a file that an option names to be read, or over the configuration."""
     from rdstitch.system.output_checks import check_not_read
 
-    read = (camera, click.get_current_context().meta.get(CONFIG_FILE))
-    check_not_read(written, [file for file in read if file is not None])
+    named = [(flag.declared, given[str(flag.name)]) for flag in flags]
+    paths = [(option, path) for option, path in named if isinstance(path, Path)]
+    read = [path for option, path in paths if option.reads]
+    if configuration := click.get_current_context().meta.get(CONFIG_FILE):
+        read.append(configuration)
+    check_not_read([path for option, path in paths if option.writes], read)
 
 
 class FilePath(click.Path):

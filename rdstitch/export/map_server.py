@@ -43,7 +43,7 @@ def write_map(result: StitchResult, folder: Path, height: float, outputs: Output
     to_map = np.array([[1.0, 0.0], [0.0, -1.0]]) @ np.column_stack([to_metres[:, :2], to_metres[:, 2] - origin])
     to_map = to_map / resolution + np.array([[0.0, 0.0, -0.5], [0.0, 0.0, length - 0.5]])
     assert result.output is not None
-    image = read_image(outputs.staged(result.output) or result.output)
+    image = read_image(outputs.where(result.output))
     grey = image.pixels if image.pixels.ndim == 2 else cv2.cvtColor(image.pixels[..., :3], cv2.COLOR_RGB2GRAY)
     if grey.dtype != np.uint8:
         low, high = float(grey.min()), float(grey.max())

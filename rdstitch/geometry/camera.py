@@ -230,10 +230,7 @@ class Camera:
     def excess_radius(self, radii: FloatArray) -> FloatArray:
         """How much farther out this lens measures rays than the nearest one-parameter lens does, pixels (N,).
 
-        Parameters
-        ----------
-        radii : ndarray of shape (N,)
-            Where this lens measures them, half diagonals from the distortion centre.
+        ``radii`` (N,) are where this lens measures them, half diagonals from the distortion centre.
         """
         nearest, scale = nearest_one_parameter(self.squared_radii(), self.distortion, self.higher)
         straight = undistort(np.stack([radii, np.zeros_like(radii)], axis=-1), self.distortion, self.higher)

@@ -56,22 +56,10 @@ def divisor_slope(radius2: FloatArray, distortion: ArrayLike, higher: Sequence[f
 
 
 def undistort(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
-    """Undistort normalized points.
+    """Undistort normalized points (..., 2); λ broadcasts, but is one number where there are μ and ν, ``higher``.
 
-    Parameters
-    ----------
-    points : array_like of shape (..., 2)
-        Distorted points, normalized with the centre at the origin.
-    distortion : array_like
-        λ in the same frame; its shape broadcasts against ``points.shape[:-1]``. One number where there is ``higher``.
-    higher : sequence of float
-        μ and ν in the same frame; those that are left out are 0.
-
-    Returns
-    -------
-    ndarray of shape (..., 2)
-        Undistorted points; NaN outside the domain: where ``g`` is not positive, and beyond the radius at which the
-        undistorted radius stops growing.
+    NaN outside the domain: where ``g`` is not positive, and beyond the radius at which the undistorted one stops
+    growing.
     """
     x = np.asarray(points, dtype=np.float64)
     radius2 = np.einsum("...i,...i->...", x, x)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rdstitch.errors import InputError
 from rdstitch.io.read import DecodedImage
-from rdstitch.results.messages import Message
+from rdstitch.results.messages import Message, left_out
 from rdstitch.system.file_access import ContentState, content_state
 
 GuardState = tuple[dict[Path, ContentState | None], dict[Path, str]]
@@ -55,9 +55,7 @@ class InputGuard:
     @property
     def warnings(self) -> list[Message]:
         """The same, and what was left out as unreadable: what may be why a run failed."""
-        reasons = {path: reason.removeprefix(f"{path}: ") for path, reason in self.unreadable.items()}
-        left_out = [Message(reasons[path], (str(path),), "left out") for path in sorted(reasons)]
-        return [*left_out, *self.messages]
+        return [*(left_out(path, self.unreadable[path]) for path in sorted(self.unreadable)), *self.messages]
 
     def state_of(self, paths: Iterable[Path]) -> GuardState:
         """What was noticed of some files, for the guard of another process."""

@@ -189,7 +189,7 @@ def read_sources(
             reason = error if isinstance(error, RdstitchError) else InputError(f"{path}: cannot be read: {error}")
             if not skip_bad:
                 raise reason from error
-            unread.append(left_out(path, str(reason).removeprefix(f"{path}: ")))
+            unread.append(left_out(path, str(reason)))
             continue
         if frame.image is not None or key not in seen:
             seen.add(key)

@@ -85,7 +85,7 @@ def mosaic_bands(
         run = replace(run, options=whole, read=[*run.read, *listed.files])
         of_first = replace(listed, frames=chosen[0])
         first = stitch_found(of_first, run, outputs, more_images=files[1:], more_files=stack)
-        saved = replace(read_sidecar(_staged(outputs, f"{files[0]}.json")), path=Path(f"{files[0]}.json"))
+        saved = replace(read_sidecar(outputs.where(f"{files[0]}.json")), path=Path(f"{files[0]}.json"))
         same = ApplyOptions(
             mask=options.mask,
             overwrite=options.overwrite,
@@ -135,7 +135,7 @@ def _stage_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, out
         alphas = [alpha for _, alpha in parts if alpha is not None]
         return np.concatenate([samples for samples, _ in parts], axis=2), reduce(np.minimum, alphas) if alphas else None
 
-    streams = [written_strips(_staged(outputs, path)) for path in bands.values()]
+    streams = [written_strips(outputs.where(path)) for path in bands.values()]
     heads = [next(stream) for stream in streams]
     names: list[str] = []
     for name, (samples, _) in zip(bands, heads, strict=True):
@@ -147,16 +147,9 @@ def _stage_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, out
     strips = map(joined, chain([heads], zip(*streams, strict=True)))
     write_strips(file, spec, strips, tags, outputs=outputs)
     # It is the first band's in all but its own bytes, which say that it is no image to stitch.
-    written, record = fingerprint(_staged(outputs, file)), sidecar(first)
+    written, record = fingerprint(outputs.where(file)), sidecar(first)
     record["output"] |= {"file": file.name, "bytes": written.size, "sha256": written.sha256}
     outputs.write(f"{file}.json", json_bytes(record))
-
-
-def _staged(outputs: Outputs, path: Path | str) -> Path:
-    """Where an output of this run lies; a file of an earlier one is none."""
-    staged = outputs.staged(path)
-    assert staged is not None, path
-    return staged
 
 
 def _by_band(frames: Sequence[Frame], bands: Mapping[str, str]) -> list[list[Frame]]:

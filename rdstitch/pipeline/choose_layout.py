@@ -15,6 +15,7 @@ from functools import cache, partial
 
 import numpy as np
 
+from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.choices import Purpose
@@ -177,13 +178,12 @@ def _other_models(
     allowed = max(options.threshold * stretched, _MISFIT * _error(registration))
     names = [name for name in _MODELS if name != alignment.model] if options.model == "auto" else []
     if first is not None and first.plan.placed.has_place:  # a map needs a plane with a metric
-        names = [name for name in names if name == "pose"]
+        names = [name for name in names if MODELS[name].has_metric_poses]
     for name in names:
         by_name = replace(aligner, options=replace(aligner.options, model=name))
         other = realigned(registration, by_name, partial(_differs, registration, allowed, stretched=stretched))
         if other is not None and _joins(other, registration, allowed):
-            reason = f"{other.alignment.model_reason.removesuffix('; as requested')}; seams break less than with a "
-            reason += f"{alignment.model} model"
+            reason = f"seams break less than with a {alignment.model} model"
             yield replace(other, alignment=replace(other.alignment, model_reason=reason))
 
 

@@ -17,9 +17,9 @@ _MAX_NAMES, _MAX_BREAKS, _MAX_DOTS = 12, 20, 5000
 _OUTLINED = {"stroke_width": 3.0, "paint_order": "stroke"}
 
 
-def mosaic_section(result: StitchResult, staged: Path | None = None) -> str:
+def mosaic_section(result: StitchResult, file: Path | None) -> str:
     """The output, small; every outline has its image's name as title, and a few images have it written."""
-    image = _thumbnail(result, staged)
+    image = _thumbnail(result, file)
     if image is None:
         if result.plan is not None or result.output is None:
             return section("Mosaic", "No image was written.")
@@ -72,11 +72,10 @@ def _broken_seams(result: StitchResult) -> str:
     return element("p", text, class_="bad" if seams.visible else "good")
 
 
-def _thumbnail(result: StitchResult, staged: Path | None = None) -> str | None:
-    """The output, or its staged file, small; None where there is none, as after a dry run, or it is huge."""
+def _thumbnail(result: StitchResult, file: Path | None) -> str | None:
+    """The output, or the file where it lies now, small; None where there is none, as after a dry run, or it is huge."""
     if result.composite is not None:
         return data_address(result.composite.pixels, _MOSAIC_SIDE)
-    file = staged or result.output
     if file is None or not file.exists():
         return None
     try:

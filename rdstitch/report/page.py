@@ -67,7 +67,7 @@ def write_report(
     """
     output = result.output if isinstance(result, StitchResult) else None
     with Outputs.or_own(outputs) as staging:
-        page = report_page(result, stages, command, None if output is None else staging.staged(output))
+        page = report_page(result, stages, command, None if output is None else staging.where(output))
         # Names of files need not be UTF-8.
         staging.write(path, page.encode("utf-8", "backslashreplace"))
 
@@ -76,14 +76,14 @@ def report_page(
     result: StitchResult | Registration,
     stages: Sequence[tuple[str, float]] = (),
     command: str = "",
-    staged: Path | None = None,
+    image: Path | None = None,
 ) -> str:
-    """The report as HTML; see :func:`write_report`. ``staged`` is the image's file until it is published."""
+    """The report as HTML; see :func:`write_report`. ``image`` is where the image lies until it is published."""
     registration = result.registration if isinstance(result, StitchResult) else result
     title, output = "rdstitch report", list[str]()
     if isinstance(result, StitchResult):
         title = title if result.output is None else result.output.name
-        output = [mosaic_section(result, staged), place_section(result), local_alignment(result)]
+        output = [mosaic_section(result, image or result.output), place_section(result), local_alignment(result)]
     body: list[Content] = [
         summary(result),
         notices(registration),

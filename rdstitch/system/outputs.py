@@ -178,9 +178,9 @@ class Outputs:
             self._number += 1
             raise
 
-    def staged(self, path: str | Path) -> Path | None:
-        """Give where an output lies until it is in its place; None where none of this name is staged."""
-        return next((item.staged for item in self._items if item.name == Path(path)), None)
+    def where(self, path: str | Path) -> Path:
+        """Where a file lies now: staged, until it is in its place."""
+        return next((item.staged for item in self._items if item.name == Path(path)), Path(path))
 
     def _stage(self, name: Path, is_folder: bool, check: Callable[[Path], None] | None) -> Path:
         place = Path(os.path.realpath(name.parent)) / name.name

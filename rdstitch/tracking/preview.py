@@ -34,7 +34,7 @@ class Preview:
         self._side = side
         self.pixels = np.zeros((0, 0, 3), dtype=np.uint8)
         self._origin = np.zeros(2, dtype=np.intp)  # of the top-left pixel, pixels from the plane's origin
-        self._scale = 0.0  # pixels per unit of the plane
+        self._scale = 1.0  # pixels per unit of the plane, by the first frame that is painted
 
     def paint(self, image: NDArray[Any], placement: Placement) -> None:
         """Paint a frame (H, W) or (H, W, C) of any size; one beyond the horizon, too large or far away is left out."""
@@ -42,7 +42,7 @@ class Preview:
         if not np.isfinite(outline).all():
             return
         extent = float(np.ptp(outline, axis=0).max())
-        if self._scale == 0.0:
+        if not self.pixels.size:
             self._scale = _FRAME_SIDE / max(extent, 1e-12)
         painted = (self._origin + np.array([[0, 0], self.pixels.shape[1::-1]])) / self._scale
         reach = float(np.ptp(np.vstack([outline, painted]), axis=0).max()) if self.pixels.size else extent

@@ -205,10 +205,10 @@ def test_names_are_escaped_and_vanished_images_do_not_matter(frames: list[Path],
 def test_overviews_are_read(rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = pano(frames[:2], tmp_path / "large.tif", replace(OPTIONS, composite=CompositeOptions(scale=3.0)))
     monkeypatch.setattr(report, "_MOSAIC_SIDE", 300)
-    whole = _decoded(report._thumbnail(result))
+    whole = _decoded(report._thumbnail(result, result.output))
     monkeypatch.setattr(preview, "_OVERVIEW_FROM", 1000)
     monkeypatch.setattr(preview, "read_image", None)
-    overview = _decoded(report._thumbnail(result))
+    overview = _decoded(report._thumbnail(result, result.output))
     assert max(whole.shape[:2]) == max(overview.shape[:2]) == 300
     # Sides of an overview are rounded up.
     height = min(len(whole), len(overview))

@@ -18,7 +18,7 @@ _SINGULAR = 1e-9
 def five_point_qep(
     x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, float] = SOLVED_DISTORTION
 ) -> Solutions:
-    """Any homography, and λ, from five points by a quadratic eigenvalue problem (Fitzgibbon, CVPR 2001, §5).
+    """The same as :func:`rdstitch.solvers.five_point`, by a quadratic eigenvalue problem (Fitzgibbon, CVPR 2001, §5).
 
     The two rows per point of the direct linear transformation that contain the lifted coordinate of image 2 are
     quadratic in λ, ``(D_0 + λ D_1 + λ² D_2) h = 0``, 10 equations for 9 entries of H. The pseudoinverse of the matrix
@@ -26,24 +26,6 @@ def five_point_qep(
     ``1 / (λ - that λ)``.
 
     :func:`rdstitch.solvers.five_point` is many times faster. This solver spreads noise over all ten equations.
-
-    Parameters
-    ----------
-    x1, x2 : array_like of shape (B, 5, 2) or (5, 2)
-        Normalized points of image 1 and image 2.
-    distortion_range : (float, float)
-        Range of λ, in the frame of the points, to search.
-
-    Returns
-    -------
-    Solutions
-        Every real λ in the range for which all points are in front of the camera and within the lens model, and the
-        homography does not mirror.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong or the range is empty.
     """
     shift = distortion_range[1] + 0.1 * (distortion_range[1] - distortion_range[0])
 

@@ -3,55 +3,43 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
-from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import ArgumentError, LimitError, OutputError
-from rdstitch.export import map_server
+from rdstitch.export.map_server import write_map
 from rdstitch.export.poses_files import poses_file
 from rdstitch.export.write_trajectory import write_trajectory
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
 from rdstitch.inputs.rosbag import opened_bag
 from rdstitch.results.pose import FollowedPoses, Pose
+from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs
 from rdstitch.tracking import TrackingResult
-from rdstitch.tracking.placement import CameraPose
+from rdstitch.tracking.placement import Placement
+from tests.registrations import registration, source, stitched
 
 PATH = Trajectory(np.arange(2), np.zeros((2, 2)), np.zeros(2), np.ones(2))
 
 
-def test_the_memory_of_a_map_is_that_of_the_turned_strip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    metadata = SimpleNamespace(channels=1, bit_depth=8)
-    result: Any = SimpleNamespace(
-        output=tmp_path / "strip.png",
-        canvas=SimpleNamespace(size=(6000, 60)),
-        placed=SimpleNamespace(sources=[SimpleNamespace(metadata=metadata)]),
-        options=SimpleNamespace(composite=SimpleNamespace(max_memory=3 * 10**6)),
-    )
-    half = np.sqrt(0.5)
-    turn = np.array([[half, -half, 0.0], [half, half, 0.0]])
-    monkeypatch.setattr(map_server, "_pixel_to_metres", lambda *_: turn)
-    monkeypatch.setattr(map_server, "read_image", Mock(side_effect=AssertionError("decoded before it was refused")))
-    with pytest.raises(LimitError, match=r"map of 428\d x 428\d pixels"), Outputs(overwrite=False) as outputs:
-        map_server.write_map(result, tmp_path, 1.0, outputs)
+def test_the_memory_of_a_map_is_that_of_the_turned_strip(tmp_path: Path) -> None:
+    """It is refused before the image, which is not there, is decoded."""
+    strip = stitched(registration(2), tmp_path / "strip.png", max_memory=3 * 10**6)
+    poses = strip.registration.alignment.poses
+    turned = replace(poses, yaw=poses.yaw + np.pi / 4)
+    alignment = replace(strip.registration.alignment, poses=turned)
+    registered = replace(strip.registration, alignment=alignment)
+    strip = replace(strip, registration=registered, canvas=replace(strip.canvas, size=(6000, 60)))
+    with pytest.raises(LimitError, match=r"map of 42[89]\d x 42[89]\d pixels"), Outputs(overwrite=False) as outputs:
+        write_map(strip, tmp_path, 1.0, outputs)
 
 
-def _result(names: list[str], cameras: list[Camera]) -> Any:
-    poses = PlanarPoses(np.zeros(2), np.zeros((2, 2)), np.ones(2), np.zeros((2, 2)))
-    sources = [SimpleNamespace(name=name, metadata=SimpleNamespace(orientation=1, gps=None)) for name in names]
-    alignment = SimpleNamespace(cameras=tuple(cameras), poses=poses)
-    return SimpleNamespace(
-        registration=SimpleNamespace(sources=sources, alignment=alignment),
-        georeference=None,
-        not_georeferenced="",
-    )
+def _result(names: list[str], cameras: list[Camera]) -> StitchResult:
+    return stitched(registration([source(name) for name in names], cameras=tuple(cameras)))
 
 
 CAMERA = Camera((640, 480), -0.1, focal=500.0)
@@ -119,8 +107,8 @@ def test_what_is_no_fault_of_the_bag_is_not_called_one(tmp_path: Path, error: Ex
 
 @pytest.mark.parametrize(("height", "unit"), [(None, 0.5), (2.0, 0.5), (2.0, np.nan)])
 def test_a_height_by_odometry_is_as_sure_as_all_its_lengths(height: float | None, unit: float) -> None:
-    placement: Any = SimpleNamespace(pose=CameraPose(3.0, 4.0, 0.0, 1.0))
-    tracked = TrackingResult(placement=placement, covariance=np.zeros((4, 4)), length_std=0.1, unit=unit, unit_std=0.1)
+    away = Placement(CAMERA, np.array([[1.0, 0.0, 3.0], [0.0, 1.0, 4.0], [0.0, 0.0, 1.0]]), 1.0)
+    tracked = TrackingResult(placement=away, covariance=np.zeros((4, 4)), length_std=0.1, unit=unit, unit_std=0.1)
     pose = Pose("a.jpg", 1, 0.0, tracked, poses=FollowedPoses(height))
     std = np.sqrt(np.diag(pose.ros_covariance))[:3]
     x, y, z = np.abs(pose.position)

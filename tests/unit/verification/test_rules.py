@@ -17,7 +17,6 @@ from rdstitch.results.messages import Message
 from rdstitch.verification import rules
 from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Kind, messages_of
-from rdstitch.verification.limits import Limit, Limits
 from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
 from rdstitch.verification.self_similarity import Ambiguity
@@ -73,12 +72,6 @@ def test_whoever_judges_keeps_to_the_table_of_rules() -> None:
         for purpose in (Purpose.CALIBRATE, Purpose.TRAJECTORY)
     }
     assert kinds == {Purpose.CALIBRATE: set(), Purpose.TRAJECTORY: {Kind.PAIR_MISFITS}}
-
-
-def test_every_threshold_has_its_unit_and_source() -> None:
-    limits = [limit for limit in vars(Limits).values() if isinstance(limit, Limit)]
-    assert len(limits) > 20
-    assert all(limit.unit and limit.source for limit in limits)
 
 
 def _fitting(share: float) -> tuple[LinkFit, ...]:
