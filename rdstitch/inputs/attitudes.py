@@ -12,6 +12,7 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.geometry.planar_motion import tilt_from_normal, turned_tilt
 from rdstitch.inputs.delays import DELAYS, MeasuredTilt
+from rdstitch.inputs.odometry import unit_quaternion
 from rdstitch.inputs.rows_of_images import RowsByImage
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, csv_rows
@@ -24,6 +25,7 @@ XMP = "xmp"
 
 _COLUMNS = {name: name for name in ("psi", "theta", "qx", "qy", "qz", "qw")}
 _COLUMNS |= {"name": IMAGE_NAMES, "timestamp": TIME_NAMES}
+_UNITS = {"timestamp": "s", "psi": "deg degrees", "theta": "deg degrees"}
 _MAX_TILT = math.radians(80.0)  # beyond, hardly an image shows ground, and more likely angles mean something else
 
 
@@ -104,7 +106,7 @@ class _TimedAttitudes:
 @cached_by_file_state
 def _read_attitudes(file: str | Path) -> RowsByImage | _TimedAttitudes:
     wanted = ("name,psi,theta", "timestamp,psi,theta", "timestamp,qx,qy,qz,qw")
-    rows = csv_rows(read_text(file), str(file), _COLUMNS, wanted, ("deg", "degrees", "s"))
+    rows = csv_rows(read_text(file), str(file), _COLUMNS, wanted, _UNITS)
     tilts = [_tilt_of(row) for row in rows]
     if any("name" in row.values for row in rows):
         return RowsByImage(rows)
@@ -123,9 +125,7 @@ def _tilt_of(row: Row) -> tuple[float, float]:
         if not (abs(psi) < 90.0 and abs(theta) < 90.0):
             raise InputError(f"{row.where}: psi and theta must lie between -90 and 90 degrees")
         return math.radians(psi), math.radians(theta)
-    x, y, z, w = (row.needed(name) for name in ("qx", "qy", "qz", "qw"))
-    if not 0.99 < math.hypot(x, y, z, w) < 1.01:
-        raise InputError(f"{row.where}: qx, qy, qz, qw are not a unit quaternion")
+    x, y, z, w = unit_quaternion([row.needed(name) for name in ("qx", "qy", "qz", "qw")], row.where)
     # Down in the body's axes, then in the camera's: right, towards the bottom of the image, ahead of the lens.
     ahead, left, up = -2.0 * (x * z - w * y), -2.0 * (y * z + w * x), -(1.0 - 2.0 * (x * x + y * y))
     psi, theta = tilt_from_normal((-left, -ahead, -up)).tolist()

@@ -1,21 +1,19 @@
 """Ground control points, by OpenDroneMap's list or a table."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
-
-import numpy as np
 
 from rdstitch.errors import InputError
 from rdstitch.geometry.crs import WGS84, Crs
 from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.inputs.named_system import NamedSystem
-from rdstitch.inputs.positions import COLUMNS, UNITS, accuracy_of, geographic_places
+from rdstitch.inputs.positions import COLUMNS, UNITS, Coordinates, accuracy_of, coordinates_of, geographic_places
 from rdstitch.inputs.rows_of_images import ImagesByName
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import Row, csv_rows, is_table, numbered_lines
+from rdstitch.inputs.tables import Row, csv_rows, is_table, numbered_lines, numbers_before, rows_of
 from rdstitch.system.file_access import read_text
 
 _ACCURACIES = {name: aliases for name, aliases in COLUMNS.items() if name.endswith("std")}
@@ -46,25 +44,24 @@ def with_ground_control(
     if file is None:
         return list(sources)
     system, body = NamedSystem.above(read_text(file))
-    rows: Iterable[Row]
-    if is_table(body, str(file), _CONTROL, UNITS):
-        rows = csv_rows(body, str(file), _CONTROL, _CONTROL_WANTED, UNITS)
-        epsg = WGS84 if any("latitude" in row.values for row in rows) else epsg
-    else:
-        rows = _opendronemap(body, str(file))
     system = system or (None if epsg is None else NamedSystem(f"EPSG:{epsg}", epsg))
-    if system is None:
+    if is_table(body, str(file), _CONTROL, _is_listed, UNITS):
+        rows = csv_rows(body, str(file), _CONTROL, _CONTROL_WANTED, UNITS)
+    elif system is None:
         raise InputError(
             f"{file}: line 1: expected a coordinate system like EPSG:32632 or WGS84 UTM 32N; or give --crs"
         )
+    else:
+        rows = _opendronemap(body, str(file))
     marks = _marks(rows, sources)
     if not marks:
         raise InputError(f"{file}: has no ground control point in any of the images")
-    places = geographic_places(system, np.array([mark.place for mark in marks]), str(file))
-    on_map = system.epsg is not None and system.epsg != WGS84 and Crs.in_metres(system.epsg) is not None
-    code = system.epsg if on_map and system.epsg is not None else WGS84
+    places = geographic_places([mark.place for mark in marks], str(file), system)
+    epsg = None if system is None else system.epsg
+    crs = None if epsg in (None, WGS84) else Crs.in_metres(epsg)
     control = list(sources)
     for mark, degrees in zip(marks, places, strict=True):
+        code = WGS84 if crs is None or mark.place.geographic else crs.epsg
         one = GroundControl(mark.point, GpsPosition(*degrees), code, mark.pixel, mark.std, check=check)
         control[mark.image] = replace(control[mark.image], control=(*control[mark.image].control, one))
     return control
@@ -75,7 +72,7 @@ class _Mark(NamedTuple):
 
     image: int  # its index
     point: str
-    place: tuple[float, float]  # x, y in the system of the list
+    place: Coordinates
     pixel: tuple[float, float]
     std: float | None  # of a coordinate of the place, m
 
@@ -85,26 +82,33 @@ def _marks(rows: Iterable[Row], sources: Sequence[Source]) -> list[_Mark]:
     marks, names = [], ImagesByName(sources)
     for row in rows:
         images, point = _images_and_point(row, names)
-        place = ("longitude", "latitude") if "longitude" in row.values else ("x", "y")
         for image in images:
-            x, y, *pixel = map(row.needed, (*place, "px", "py"))
+            pixel, place = (row.needed("px"), row.needed("py")), coordinates_of(row)
+            if place is None:
+                raise InputError(f"{row.where}: has no coordinates")
             width, height = sources[image].metadata.size
             if not (-0.5 <= pixel[0] < width - 0.5 and -0.5 <= pixel[1] < height - 0.5):
                 where = f"the {width} x {height} pixels of {sources[image].name}"
                 raise InputError(f"{row.where}: is not within {where}")
             accuracy = accuracy_of(row)
-            named = point or f"{x:.12g} {y:.12g}"
-            marks.append(_Mark(image, named, (x, y), (pixel[0], pixel[1]), accuracy and accuracy[0]))
+            named = point or f"{place.x:.12g} {place.y:.12g}"
+            marks.append(_Mark(image, named, place, pixel, accuracy and accuracy[0]))
     return marks
 
 
-def _opendronemap(text: str, file: str) -> Iterator[Row]:
+def _is_listed(line: str) -> bool:
+    return len(numbers_before(line.split(maxsplit=5)[:5])) == 5
+
+
+def _opendronemap(text: str, file: str) -> list[Row]:
     """The lines of a ``gcp_list.txt`` below its coordinate system; what follows the numbers is an image and a point."""
+    found = []
     for where, line in numbered_lines(text, file):
         fields = line.split(maxsplit=5)
         if len(fields) < 6:
             raise InputError(f"{where}: expected X Y Z PX PY IMAGE [NAME], or a heading like {_CONTROL_WANTED[0]}")
-        yield Row(where, dict(zip(_CONTROL_LISTED, fields, strict=True)), ".")
+        found.append((where, zip(_CONTROL_LISTED, fields, strict=True)))
+    return rows_of(found)
 
 
 def _images_and_point(row: Row, names: ImagesByName) -> tuple[list[int], str]:

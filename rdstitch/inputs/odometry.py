@@ -18,6 +18,8 @@ _COLUMNS = {"timestamp": TIME_NAMES} | {
     name: name.replace("_", "")
     for name in ("x", "y", "yaw", "yaw_deg", "qx", "qy", "qz", "qw", "cov_x_x", "cov_y_y", "cov_yaw_deg_yaw_deg")
 }
+_UNITS = {"timestamp": "s", "x": "m", "y": "m", "yaw": "rad", "yaw_deg": "deg"}
+_UNITS |= {"cov_x_x": "m m2 m²", "cov_y_y": "m m2 m²", "cov_yaw_deg_yaw_deg": "deg deg2 deg²"}
 _LISTED = 8  # numbers in TUM's lines
 _SLIP = 0.02  # share of distances and turns that wheels are off by if they do not say
 
@@ -79,12 +81,12 @@ def read_odometry(file: str | Path) -> Odometry:
         return odometry_of([_listed_pose(*line) for line in lines], where)
     wanted = ("timestamp,x,y,yaw_deg", "timestamp,x,y,yaw", "timestamp,x,y,qx,qy,qz,qw")
     table = []
-    for row in csv_rows(text, where, _COLUMNS, wanted, ("s", "m", "deg", "rad")):
+    for row in csv_rows(text, where, _COLUMNS, wanted, _UNITS):
         yaw = row.number("yaw")
         if yaw is None and (degrees := row.number("yaw_deg")) is not None:
             yaw = math.radians(degrees)
         if yaw is None:
-            yaw = yaw_of(*(row.needed(name) for name in ("qx", "qy", "qz", "qw")))
+            yaw = yaw_of(unit_quaternion([row.needed(name) for name in ("qx", "qy", "qz", "qw")], row.where))
         x_x, y_y, turn = (row.number(name) for name in ("cov_x_x", "cov_y_y", "cov_yaw_deg_yaw_deg"))
         place = math.nan if x_x is None or y_y is None else (x_x + y_y) / 2.0
         turned = math.nan if turn is None else math.radians(math.sqrt(max(turn, 0.0))) ** 2
@@ -97,7 +99,7 @@ def _listed_pose(where: str, line: str) -> tuple[float, ...]:
     if len(parts) != _LISTED or not all(map(is_number, parts)):
         raise InputError(f"{where}: expected timestamp tx ty tz qx qy qz qw, found '{line}'")
     time, x, y, _, *turn = map(float, parts)
-    return time, x, y, yaw_of(*turn), math.nan, math.nan
+    return time, x, y, yaw_of(unit_quaternion(turn, where)), math.nan, math.nan
 
 
 def odometry_of(rows: Sequence[tuple[float, ...]], where: str) -> Odometry:
@@ -110,6 +112,15 @@ def odometry_of(rows: Sequence[tuple[float, ...]], where: str) -> Odometry:
     return Odometry(values[:, 0], values[:, 1:])
 
 
-def yaw_of(x: float, y: float, z: float, w: float) -> float:
-    """The turn about z of a quaternion, radians."""
+def unit_quaternion(parts: Sequence[float], where: str) -> tuple[float, float, float, float]:
+    """A quaternion x, y, z, w as a file has it, which must be one of a rotation."""
+    if not 0.99 < (length := math.hypot(*parts)) < 1.01:
+        raise InputError(f"{where}: {', '.join(f'{part:g}' for part in parts)} is not a unit quaternion")
+    x, y, z, w = (part / length for part in parts)
+    return x, y, z, w
+
+
+def yaw_of(quaternion: tuple[float, float, float, float]) -> float:
+    """The turn about z of a unit quaternion, radians."""
+    x, y, z, w = quaternion
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

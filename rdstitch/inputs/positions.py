@@ -15,6 +15,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,10 +23,11 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.crs import WGS84, Crs
 from rdstitch.geometry.places import GpsPosition
+from rdstitch.inputs.image_folders import READABLE_SUFFIXES
 from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.inputs.rows_of_images import RowsByImage
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import NUMERAL, Row, csv_rows, is_table, json_rows, listed_rows
+from rdstitch.inputs.tables import NUMERAL, Row, csv_rows, is_table, json_rows, numbered_lines, numbers_before, rows_of
 from rdstitch.inputs.tracks import by_events, is_list_of_events, on_track, subtitle_points, track_points
 from rdstitch.system.file_access import read_text
 
@@ -46,8 +48,15 @@ _SIDES = (("latitude", "south"), ("longitude", "west"))
 _SIDE_WORDS = {"latitude": ("n", "north", "s", "south"), "longitude": ("e", "east", "w", "west")}
 _UNIT_WORDS = ["d", "deg", "degree", "degrees", "º", "m", "min", "minute", "minutes", "sec", "second", "seconds"]
 _LISTED = ("name", "x", "y", "altitude", "yaw", "pitch", "roll", "north_std", "up_std")  # in geo.txt
+_NUMBER_IN_WORD = re.compile(rf"(?:.*[,;])?{NUMERAL.pattern}")
 _WANTED = ("name,latitude,longitude", "name,x,y")
-UNITS = ("deg", "degrees", "m", "metres", "meters")
+# Words that follow an image's ending, or another one in the last folder.
+_BEHIND_A_NAME = re.compile(
+    rf"({'|'.join(map(re.escape, READABLE_SUFFIXES))}|\.[A-Za-z]\w+(?!.*[\\/]))\s(?!.*\.[A-Za-z]\w+$)", re.IGNORECASE
+)
+_METRES, _DEGREES = "m metres meters", "deg degrees"
+UNITS = {"latitude": _DEGREES, "longitude": _DEGREES, "x": f"{_METRES} {_DEGREES}", "y": f"{_METRES} {_DEGREES}"}
+UNITS |= dict.fromkeys(("altitude", "north_std", "east_std", "up_std"), _METRES)
 _RECORDS = "a list of objects with SourceFile, GPSLatitude and GPSLongitude"
 
 
@@ -108,51 +117,71 @@ def _places(sources: Sequence[Source], file: str | Path, epsg: int | None, offse
         named, below = NamedSystem.above(text)
         if text.lstrip().startswith(("[", "{")):
             rows = json_rows(text, name, COLUMNS, _RECORDS)
-        elif named is None or is_table(below, name, COLUMNS, UNITS):
+        elif named is None or is_table(below, name, COLUMNS, _listed_fields, UNITS):
             rows, system = csv_rows(below, name, COLUMNS, _WANTED, UNITS), named or system
         else:
-            rows, system = listed_rows(below, name, _LISTED), named
-        named_rows = RowsByImage(row for row in rows if _coordinates(row) is not None)
+            rows, system = _listed(below, name), named
+        named_rows = RowsByImage(row for row in rows if coordinates_of(row) is not None)
         places = _by_rows(named_rows.of(sources), name, system)
         if not any(places):
             raise InputError(f"{file}: has no position of {sources[0].name}, nor of any other of the images")
     return places
 
 
+def _listed(text: str, file: str) -> list[Row]:
+    """The lines of a ``geo.txt`` below its coordinate system."""
+    found = []
+    for where, line in numbered_lines(text, file):
+        if not (fields := _listed_fields(line)):
+            raise InputError(f"{where}: expected a name and numbers between blanks, not '{line}'")
+        found.append((where, zip(_LISTED, fields, strict=False)))
+    return rows_of(found)
+
+
+def _listed_fields(line: str) -> list[str]:
+    """A name, which may hold blanks, and two numbers or more, which other words may follow; empty for other lines."""
+    fields, most = line.split(), len(_LISTED) - 1
+    for end in range(1, len(fields)):
+        rest = fields[end : end + most]
+        numbers = numbers_before(rest)
+        if len(numbers) > 1 and not any(map(_NUMBER_IN_WORD.match, rest[len(numbers) :])):
+            name = line.rsplit(maxsplit=len(fields) - end)[0]
+            return [] if _BEHIND_A_NAME.search(name) else [name, *numbers]
+    return []
+
+
 def _by_rows(rows: Sequence[Row | None], file: str, system: NamedSystem | None) -> list[GpsPosition | None]:
     """The positions that rows tell."""
     places: list[GpsPosition | None] = []
-    projected: dict[int, tuple[float, float]] = {}  # by index
-    for index, row in enumerate(rows):
-        if row is None or (found := _coordinates(row)) is None:
+    found = [None if row is None else coordinates_of(row) for row in rows]
+    degrees = iter(geographic_places([each for each in found if each is not None], file, system))
+    for row, each in zip(rows, found, strict=True):
+        if row is None or each is None:
             places.append(None)
             continue
-        x, y, geographic = found
         altitude = next(iter(row.numbers_within("altitude")), None)
         if altitude is not None and "below" in row.values["altitude"].lower():
             altitude = -altitude
-        if geographic or (system is not None and system.epsg == WGS84):
-            if not (abs(y) <= 90.0 and abs(x) <= 180.0):
-                raise InputError(f"{row.where}: expected latitude and longitude in degrees, not {y:g} and {x:g}")
-        elif system is None:
-            raise InputError(f"{row.where}: in which coordinate system x and y are is not known; give --crs")
-        else:
-            projected[index] = x, y
-        places.append(GpsPosition(y, x, altitude, accuracy_of(row)))
-    if projected:
-        assert system is not None
-        degrees = geographic_places(system, np.array(list(projected.values())), file)
-        for index, (latitude, longitude) in zip(projected, degrees, strict=True):
-            place = places[index]
-            places[index] = place and replace(place, latitude=latitude, longitude=longitude)
+        places.append(GpsPosition(*next(degrees), altitude, accuracy_of(row)))
     return places
 
 
-def _coordinates(row: Row) -> tuple[float, float, bool] | None:
-    """X and y, and whether they are longitude and latitude; None where the row has no position, or no fix."""
+class Coordinates(NamedTuple):
+    """What a row says of a place."""
+
+    where: str  # the file and the line, for messages
+    x: float
+    y: float
+    geographic: bool  # whether they are longitude and latitude, whatever system the file has
+
+
+def coordinates_of(row: Row) -> Coordinates | None:
+    """Those of a row; None where it has no position, or no fix."""
     geographic = not row.values.keys().isdisjoint(("latitude", "longitude"))
     y, x = (_degrees(row, *c) for c in _SIDES) if geographic else (row.number("y"), row.number("x"))
-    return None if x is None or y is None or (geographic and x == y == 0.0) else (x, y, geographic)
+    return (
+        None if x is None or y is None or (geographic and x == y == 0.0) else Coordinates(row.where, x, y, geographic)
+    )
 
 
 def accuracy_of(row: Row) -> tuple[float, float] | None:
@@ -164,14 +193,22 @@ def accuracy_of(row: Row) -> tuple[float, float] | None:
     return math.hypot(along, across) / math.sqrt(2.0), up if up and up > 0.0 else 2.0 * max(along, across)
 
 
-def geographic_places(system: NamedSystem, places: FloatArray, file: str) -> list[tuple[float, float]]:
-    """Latitude and longitude of eastings and northings (N, 2)."""
-    try:
-        degrees = system.geographic(places)
-    except ArgumentError as error:
-        raise InputError(f"{file}: {error}") from error
-    if not (np.isfinite(degrees).all() and (np.abs(degrees) <= (90.0, 180.0)).all()):
-        raise InputError(f"{file}: {system.text} has no such places; give the coordinate system of x and y")
+def geographic_places(found: Sequence[Coordinates], file: str, system: NamedSystem | None) -> list[tuple[float, float]]:
+    """Latitude and longitude of each: those that it has, else by the system of x and y."""
+    degrees = np.array([(one.y, one.x) for one in found]).reshape(-1, 2)
+    projected = np.array([not one.geographic and (system is None or system.epsg != WGS84) for one in found], dtype=bool)
+    for one, on_map in zip(found, projected.tolist(), strict=True):
+        if on_map and system is None:
+            raise InputError(f"{one.where}: in which coordinate system x and y are is not known; give --crs")
+        if not on_map and not (abs(one.y) <= 90.0 and abs(one.x) <= 180.0):
+            raise InputError(f"{one.where}: expected latitude and longitude in degrees, not {one.y:g} and {one.x:g}")
+    if system is not None and projected.any():
+        try:
+            degrees[projected] = system.geographic(degrees[projected][:, ::-1])
+        except ArgumentError as error:
+            raise InputError(f"{file}: {error}") from error
+        if not (np.isfinite(degrees).all() and (np.abs(degrees) <= (90.0, 180.0)).all()):
+            raise InputError(f"{file}: {system.text} has no such places; give the coordinate system of x and y")
     return [(latitude, longitude) for latitude, longitude in degrees.tolist()]
 
 
@@ -180,13 +217,14 @@ def _degrees(row: Row, column: str, reference: str) -> float | None:
     if not (parts := row.numbers_within(column)):
         return row.number(column)
     text = row.values[column]
-    value = sum(abs(part) / 60.0**k for k, part in enumerate(parts[:3]))
+    value = sum(abs(part) / 60.0**k for k, part in enumerate(parts))
     words = re.findall(r"[^\W\d_]+", NUMERAL.sub(" ", text).lower())
     if "m" in words and "s" in words:
         words.remove("s")  # 33d 51m 20s N: seconds
     given = row.values.get(reference, "").lower()
     sides = {word[0] for word in (*words, given) if word in _SIDE_WORDS[column]}
-    if len(sides) > 1 or not {*words} <= {*_SIDE_WORDS[column], *_UNIT_WORDS}:
+    whole = all(part.is_integer() for part in parts[:-1]) and all(abs(part) < 60.0 for part in parts[1:])
+    if len(parts) > 3 or not whole or len(sides) > 1 or not {*words} <= {*_SIDE_WORDS[column], *_UNIT_WORDS}:
         raise InputError(f"{row.where}: expected a {column} like 33.85, -33.85 or 33 51 S, not '{text}'")
     if not sides and "deg" in text:
         raise InputError(f"{row.where}: '{text}' does not say whether north or south, east or west; add N, S, E or W")

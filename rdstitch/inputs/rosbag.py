@@ -12,7 +12,7 @@ import numpy as np
 
 from rdstitch.errors import InputError, RdstitchError
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.odometry import Odometry, odometry_of, yaw_of
+from rdstitch.inputs.odometry import Odometry, odometry_of, unit_quaternion, yaw_of
 from rdstitch.system.file_access import read_beginning
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def odometry_in_bag(path: Path, topic: str) -> Odometry:
             message = reader.deserialize(data, connection.msgtype)
             stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
             at, turn, known = message.pose.pose.position, message.pose.pose.orientation, message.pose.covariance
-            yaw = yaw_of(turn.x, turn.y, turn.z, turn.w)
+            yaw = yaw_of(unit_quaternion((turn.x, turn.y, turn.z, turn.w), f"{path}: {topic}"))
             rows.append((stamp or time_ns * 1e-9, at.x, at.y, yaw, (known[0] + known[7]) / 2.0, known[35]))
     return odometry_of(rows, f"{path}: {topic}")
 

@@ -3,16 +3,17 @@
 A caller says which columns it knows and what else they are called, and which of them a table must have::
 
     COLUMNS = {"name": "name file image", "x": "x easting", "y": "y northing"}
-    for row in csv_rows(text, file, COLUMNS, ("name,x,y",), units=("m",)):
+    for row in csv_rows(text, file, COLUMNS, ("name,x,y",), units={"x": "m", "y": "m"}):
         row.image, row.number("x"), row.number("y")
 
 Lists that are no tables are read line by line: :func:`numbered_lines`.
 
 Headings count without regard to case, blanks, underscores and a group (``EXIF:``). A unit in brackets belongs to the
-heading where the caller knows it so (``x (um)`` is ``xum``); else it must be one of ``units``. The delimiter is the
-comma, semicolon or tab that is in the heading most often. Lines that begin with ``#`` say nothing, except that the
-heading may stand in one. Numbers are read in either notation (``580,015.975``, ``580.015,975``, ``580'015.975``); what
-could be two numbers is one of them where the rest of the table shows the decimal mark, and refused elsewhere.
+heading where the caller knows it so (``x (um)`` is ``xum``); else it must be one of the column's ``units``. The
+delimiter is the comma, semicolon or tab that is in the heading most often. Lines that begin with ``#`` say nothing,
+except that the heading may stand in one. Numbers are read in either notation (``580,015.975``, ``580.015,975``,
+``580'015.975``); what could be two numbers is one of them where the rest of the table shows the decimal mark, and
+refused elsewhere.
 
 Every complaint names the file and the line. Which image a row is about, :mod:`rdstitch.inputs.rows_of_images` finds.
 """
@@ -22,8 +23,10 @@ import io
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import takewhile
 from math import isfinite
+from types import MappingProxyType
 from typing import Any
 
 from rdstitch.errors import InputError
@@ -41,8 +44,8 @@ _NOTATIONS = {
     for mark, other in (".,", ",.")
 }
 _GROUPED = re.compile(r"(?<=\d)[\s'’](?=\d{3}(?!\d))")
-_BEHIND_A_NAME = re.compile(r"\.[A-Za-z]\w+\s(?!.*(\.[A-Za-z]\w+$|[\\/]))")  # words that follow a file's ending
 NUMERAL = re.compile(r"[-+\u2212]?[.,]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+)?")
+_NO_UNITS = MappingProxyType[str, str]({})
 
 
 @dataclass(frozen=True)
@@ -102,13 +105,13 @@ def name_parts(text: str) -> tuple[str, ...]:
 
 
 def csv_rows(
-    text: str, file: str, columns: Mapping[str, str], wanted: Sequence[str], units: Sequence[str] = ()
+    text: str, file: str, columns: Mapping[str, str], wanted: Sequence[str], units: Mapping[str, str] = _NO_UNITS
 ) -> list[Row]:
     """The rows of a CSV file with a heading; ``wanted`` are the columns that there must be, and alternatives to them.
 
     They are named by headings, as messages name them. Of each column ``columns`` has all headings that mean it, between
-    blanks. Others are ignored; of several with one meaning the last counts that is not empty. ``file`` is what messages
-    call it.
+    blanks, and ``units`` all units of a heading. Others are ignored; of several with one meaning the last counts that
+    is not empty, but no two numbers that differ, unless they are of groups. ``file`` is what messages call it.
     """
     if "\0" in text:
         raise InputError(f"{file}: is not UTF-8 text; save it as CSV in UTF-8")
@@ -121,8 +124,8 @@ def csv_rows(
     reader = csv.reader([heading, *rest], delimiter=_delimiter(heading), skipinitialspace=True, strict=True)
     try:
         headings = next(reader, [])
-        meanings = [known(heading) for heading in headings]
-        if not any({known(name) or name for name in names.split(",")} <= set(meanings) for names in wanted):
+        meanings = set(map(known, headings))
+        if not any({known(name) or name for name in names.split(",")} <= meanings for names in wanted):
             raise InputError(f"{file}: its first line names no columns like {' or '.join(wanted)}")
         rows = []
         for fields in reader:
@@ -130,18 +133,30 @@ def csv_rows(
             if any(field.strip() for field in fields[len(headings) :]):
                 raise InputError(f"{where}: has {len(fields)} fields, but there are {len(headings)} columns")
             if any(field.strip() for field in fields):
-                rows.append((where, zip(meanings, fields, strict=False)))
+                rows.append((where, zip(headings, fields, strict=False)))
     except csv.Error as error:
         raise InputError(f"{file}: line {reader.line_num + start}: is not CSV: {error}") from error
-    return _rows(rows)
+    if not rows:
+        raise InputError(f"{file}: has no rows below its heading")
+    return rows_of(rows, known)
 
 
-def is_table(text: str, file: str, columns: Mapping[str, str], units: Sequence[str] = ()) -> bool:
-    """Whether it is what :func:`csv_rows` reads, not a list, above which a comment may name columns too."""
+def is_table(
+    text: str,
+    file: str,
+    columns: Mapping[str, str],
+    is_listed: Callable[[str], object],
+    units: Mapping[str, str] = _NO_UNITS,
+) -> bool:
+    """Whether it is what :func:`csv_rows` reads, not a list, above which a comment may name columns too.
+
+    ``is_listed`` tells a line of the list, which may hold decimal commas.
+    """
     known = _finder(file, columns, units)
     heading = next((line for line in text.splitlines() if _is_heading(line, known)), "")
     first = next((line for _, line in numbered_lines(text, file)), "")
-    return _names_columns(heading, known) and _delimiter(heading) in first
+    delimiter = _delimiter(heading)
+    return _names_columns(heading, known) and delimiter in first and (delimiter == "\t" or not is_listed(first))
 
 
 def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> list[Row]:
@@ -149,11 +164,8 @@ def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> 
     content = parse_json(text, file)
     if not isinstance(content, list) or not all(isinstance(item, dict) for item in content):
         raise InputError(f"{file}: expected {wanted}")
-    known = _finder(file, columns, ())
-    return _rows(
-        (f"{file}: [{number}]", ((known(key), value) for key, value in item.items()))
-        for number, item in enumerate(content)
-    )
+    rows = ((f"{file}: [{number}]", item.items()) for number, item in enumerate(content))
+    return rows_of(rows, _finder(file, columns, _NO_UNITS))
 
 
 def numbered_lines(text: str, file: str) -> list[tuple[str, str]]:
@@ -162,32 +174,29 @@ def numbered_lines(text: str, file: str) -> list[tuple[str, str]]:
     return [(where, line) for where, line in lines if line and not line.startswith("#")]
 
 
-def listed_rows(text: str, file: str, columns: Sequence[str]) -> list[Row]:
-    """Lines of a name, which may hold blanks, two numbers or more, and other words; see :func:`numbered_lines`."""
+def numbers_before(fields: Sequence[str]) -> list[str]:
+    """Those of the fields before the first that is no number, nor an empty one."""
+    return list(takewhile(lambda field: _readings(field) or field.lower() in _EMPTY, fields))
+
+
+def rows_of(
+    found: Iterable[tuple[str, Iterable[tuple[str, Any]]]], column_of: Callable[[str], str | None] = str
+) -> list[Row]:
+    """Rows of cells with their headings, with the decimal mark that their unambiguous numbers share."""
     rows = []
-    for where, line in numbered_lines(text, file):
-        fields = line.split()
-        found = ((end, _numbers_before_words(fields[end : end + len(columns) - 1])) for end in range(1, len(fields)))
-        end, numbers = next(((end, numbers) for end, numbers in found if numbers), (1, []))
-        name = line.rsplit(maxsplit=len(fields) - end)[0]
-        if not numbers or _BEHIND_A_NAME.search(name):
-            raise InputError(f"{where}: expected a name and numbers between blanks, not '{line}'")
-        rows.append((where, zip(columns, (name, *numbers), strict=False)))
-    return _rows(rows)
-
-
-def _numbers_before_words(fields: Sequence[str]) -> list[str]:
-    """The numbers that the fields begin with, where they are two or more and no word behind them begins like one."""
-    numbers = list(takewhile(lambda field: _readings(field) or field.lower() in _EMPTY, fields))
-    return [] if len(numbers) < 2 or any(map(NUMERAL.match, fields[len(numbers) :])) else numbers
-
-
-def _rows(found: Iterable[tuple[str, Iterable[tuple[str | None, Any]]]]) -> list[Row]:
-    """Rows with the decimal mark that their unambiguous numbers share."""
-    rows = []
-    for where, pairs in found:
-        texts = ((column, "" if value is None else str(value).strip()) for column, value in pairs)
-        rows.append((where, {column: value for column, value in texts if column and value}))
+    for where, cells in found:
+        values: dict[str, str] = {}
+        for heading, cell in cells:
+            column, text = column_of(heading), "" if cell is None else str(cell).strip()
+            if not column or not text:
+                continue
+            if column in values and column != "name" and ":" not in heading:
+                before, now = _readings(values[column]), _readings(text)
+                if before and now and {*before.values()}.isdisjoint(now.values()):
+                    two = f"{values[column]} and {text}"
+                    raise InputError(f"{where}: has two numbers for {column}, {two}; remove one of the columns")
+            values[column] = text
+        rows.append((where, values))
     numerals = {
         numeral
         for _, values in rows
@@ -211,23 +220,26 @@ def _readings(text: str) -> dict[str, float]:
     return numbers
 
 
-def _finder(file: str, columns: Mapping[str, str], units: Sequence[str]) -> Callable[[str], str | None]:
+def _finder(file: str, columns: Mapping[str, str], units: Mapping[str, str]) -> Callable[[str], str | None]:
     """Which column a heading means."""
     meaning = {alias: column for column, aliases in columns.items() for alias in aliases.split()}
 
     def plain(text: str) -> str:
-        return "".join(letter for letter in text.lower() if letter.isalpha()).replace("µ", "u").replace("μ", "u")
+        return "".join(letter for letter in text.lower() if letter.isalnum()).replace("µ", "u").replace("μ", "u")
 
+    @cache
     def find(heading: str) -> str | None:
         parts = _HEADING.fullmatch(str(heading))
         assert parts is not None
         word, unit = plain(parts[1]), plain(parts[2] or "")
         if word + unit in meaning:
             return meaning[word + unit]
-        if meaning.get(word, "name") != "name" and unit not in ("", *units):
-            known = f"; give it in {' or '.join(units)}" if units else ""
-            raise InputError(f"{file}: the column '{heading.strip()}' has a unit that is not known here{known}")
-        return meaning.get(word)
+        column = meaning.get(word)
+        known = units.get(column or "", "").split()
+        if column not in (None, "name") and unit not in ("", *known):
+            remedy = f"; give it in {' or '.join(known)}" if known else ""
+            raise InputError(f"{file}: the column '{heading.strip()}' has a unit that is not known here{remedy}")
+        return column
 
     return find
 

@@ -45,8 +45,9 @@ def with_times(frames: Sequence[Frame], file: str | Path | None) -> list[Frame]:
     if len(np.unique(numbers)) < len(numbers):  # of several videos
         numbers = np.arange(len(frames))
     steps = np.unique(np.diff(np.sort(numbers)))
-    # Of every n-th frame of a video up to n - 1 may follow the last; of chosen ones, any number.
-    most = numbers.max() + steps[0] if len(steps) == 1 else math.inf if len(steps) else 1
+    # Of every n-th frame of a video up to n - 1 may follow the last; of chosen ones, and of one, any number.
+    of_video = frames[0].number is not None and frames[0].image is None
+    most = numbers.max() + steps[0] if len(steps) == 1 else math.inf if len(steps) or of_video else 1
     if not numbers.max() < len(named) <= most:
         last = f" or frames, the last with the number {numbers.max()} from 0" if most != len(frames) else ""
         raise InputError(f"{file}: has {len(named)} times for {len(frames)} images{last}; give one for each, in order")
@@ -81,7 +82,7 @@ def _read_times(file: str | Path) -> list[float] | RowsByImage:
     if lines and all(is_number(line) for _, line in lines):
         return [float(line) for _, line in lines]
     if not lines or not is_number(lines[0][1].split()[0]):
-        rows = csv_rows(text, str(file), _COLUMNS, ("name,timestamp",), ("s",))
+        rows = csv_rows(text, str(file), _COLUMNS, ("name,timestamp",), {"timestamp": "s"})
     else:
         rows = []
         for where, line in lines:

@@ -67,12 +67,12 @@ def subtitle_points(text: str) -> list[tuple[float, float, float, float]]:
 
 
 def track_points(text: str, file: str) -> list[tuple[float, float, float, float]]:
-    """Seconds since 1970, latitude, longitude and altitude of the points of a GPX track."""
+    """Seconds since 1970, latitude, longitude and altitude of a GPX track, else of a route, else of waypoints."""
+    timed = [item for item in parse_xml(text, file).iter() if item.findtext("time") is not None]
+    by_kind = ([item for item in timed if item.tag == kind] for kind in ("trkpt", "rtept", "wpt"))
     points = []
-    for item in parse_xml(text, file).iter():
-        time = item.findtext("time")
-        if item.tag not in ("trkpt", "rtept", "wpt") or time is None:
-            continue
+    for item in next(filter(None, by_kind), []):
+        time = item.findtext("time", "")
         try:
             moment = datetime.fromisoformat(time.strip())
             values = (float(item.get("lat", "")), float(item.get("lon", "")), float(item.findtext("ele") or "nan"))

@@ -37,6 +37,11 @@ class BandLens:
     shift: float  # median distance of what the band shows from where the registered image has it, pixels
     error: float  # what is left of it
 
+    @property
+    def is_same(self) -> bool:
+        """Whether it is the lens that took the registered images, as far as can be told."""
+        return self.shift < max(_WORTH_CORRECTING, self.error)
+
     def camera(self, camera: Camera) -> Camera:
         """The band's camera beside a registered one."""
         return replace(camera, distortion=camera.distortion + self.distortion)
@@ -45,9 +50,9 @@ class BandLens:
 def band_lens(
     pairs: Mapping[int, tuple[Source, Source]], report: Callable[[int, int], None] = lambda done, total: None
 ) -> BandLens | None:
-    """The lens of a band from registered images and those that take their place, by numbers; None where it is the same.
+    """The lens of a band from registered images and those that take their place, by numbers.
 
-    Where the images show nothing in common, as masks do, nothing is known, and nothing changed. Raises InputError where
+    None where nothing is known of it, since the images show nothing in common, as masks do. Raises InputError where
     images were evidently not taken from the same places.
     """
     chosen = evenly_spaced(len(pairs), _MAX_IMAGES).tolist()
@@ -59,18 +64,19 @@ def band_lens(
     for done, pair in enumerate(compared):
         report(done, len(compared))
         edges.append((edges_of(pair[0].read().pixels), edges_of(pair[1].read().pixels)))
-    coarse = [coarse_shift(*each) for each in edges]
-    _refuse_other_places(compared, edges, coarse)
-    expected: Callable[[FloatArray], FloatArray] = partial(np.add, np.median(coarse, axis=0))
-    camera = compared[0][0].camera
-    found = BandLens(np.eye(3), 0.0, 0.0, 0.0)
+    coarse = np.array([coarse_shift(*each) for each in edges])
+    sure = [k for k, each in enumerate(edges) if _is_shifted(*each, coarse[k])]
+    if not sure:
+        return None
+    _refuse_other_places([compared[k] for k in sure], coarse[sure])
+    expected: Callable[[FloatArray], FloatArray] = partial(np.add, np.median(coarse[sure], axis=0))
+    camera, found = compared[0][0].camera, None
     for _ in range(_ROUNDS):
-        shifts = [patch_shifts(*each, expected) for each in edges]
-        fitted = _fit(camera, shifts)
-        if fitted is None:
+        found = _fit(camera, [patch_shifts(*edges[k], expected) for k in sure])
+        if found is None:
             return None
-        found, expected = fitted, partial(_seen_by_band, camera, fitted.homography, fitted.distortion)
-    return None if found.shift < max(_WORTH_CORRECTING, found.error) else found
+        expected = partial(_seen_by_band, camera, found.homography, found.distortion)
+    return found
 
 
 def _seen_by_band(camera: Camera, homography: FloatArray, distortion: float, points: FloatArray) -> FloatArray:
@@ -106,24 +112,23 @@ def _fit(camera: Camera, shifts: Sequence[FloatArray]) -> BandLens | None:
     return BandLens(homography, float(result.x[8]), float(np.median(moved)), float(np.median(off[agreeing])))
 
 
-def _refuse_other_places(
-    compared: Sequence[tuple[Source, Source]], edges: Sequence[tuple[Edges, Edges]], coarse: Sequence[FloatArray]
-) -> None:
+def _is_shifted(first: Edges, second: Edges, shift: FloatArray) -> bool:
+    """Whether patches of the second image agree that it shows what the first does by that much (2,) shifted."""
+    points, others = patch_shifts(first, second, partial(np.add, shift))
+    away = np.linalg.norm(others - points - shift, axis=1)
+    return len(away) > 0 and float((away < 3.0 * _AGREEING * math.hypot(*first.shape)).mean()) > _ENOUGH
+
+
+def _refuse_other_places(compared: Sequence[tuple[Source, Source]], shifts: FloatArray) -> None:
     """Refuse images that show the same as the registered ones, but each shifted by something else."""
-    diagonal = math.hypot(*edges[0][0].shape)
-    sure = []
-    for (first, second), shift in zip(edges, coarse, strict=True):
-        points, others = patch_shifts(first, second, partial(np.add, shift))
-        away = np.linalg.norm(others - points - shift, axis=1)
-        sure.append(len(away) > 0 and float((away < 3.0 * _AGREEING * diagonal).mean()) > _ENOUGH)
-    if sum(sure) < 2:
-        return
-    shifts = np.array(coarse)
-    off = np.where(sure, np.linalg.norm(shifts - np.median(shifts[sure], axis=0), axis=1), 0.0)
+    off = np.linalg.norm(shifts - np.median(shifts, axis=0), axis=1)
     worst = int(np.argmax(off))
-    if off[worst] > _ELSEWHERE * diagonal:
-        registered, given = compared[worst]
+    registered, given = compared[worst]
+    if off[worst] > _ELSEWHERE * math.hypot(*registered.camera.image_size):
+        others = [other for _, other in compared if other is not given]
+        further = np.linalg.norm(shifts[worst] - np.median(np.delete(shifts, worst, axis=0), axis=0))
+        whom, which = (f"{others[0].name} does", "one of them") if len(others) == 1 else ("the others do", "it")
         raise InputError(
-            f"{given.path}: shows what {registered.name} does {off[worst]:.0f} pixels further off than the "
-            "others do: it was not taken from the same place; stitch these images separately"
+            f"{given.path}: shows what {registered.name} does {further:.0f} pixels further off than {whom}: "
+            f"{which} was not taken from the same place; stitch these images separately"
         )

@@ -186,7 +186,10 @@ def _lens_of_band(
             if read and read[0].metadata.size == size:
                 pairs[index] = replace(read[0], camera=camera), used[index]
     lens = band_lens(pairs, lambda done, total: progress("comparing bands", done, total))
-    if lens is None:
+    if lens is None and pairs:
+        text = "the given images show nothing that the registered ones do: whether the same lens took them is not known"
+        return None, [Message(f"{saved.path}: {text}", severity="note")]
+    if lens is None or lens.is_same:
         return None, []
     text = f"{lens.shift:.1f} pixels (median) from the registered band, {lens.error:.1f} with its lens registered too"
     return lens, [Message(text, severity="note", code="band-lens")]

@@ -1,5 +1,6 @@
 """Wheel odometry: the scale of a path, poses of frames that show nothing, offline and live."""
 
+import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -201,6 +202,17 @@ def test_odometry_is_read_from_tum_and_refused_by_line(tmp_path: Path) -> None:
     file.write_text("1 0 0 0 0 0 0 1\n2 1 0.5 0 0 0 one 1\n", encoding="utf-8")
     with pytest.raises(InputError, match="line 2"):
         read_odometry(file)
+    table = "timestamp,x,y,qx,qy,qz,qw\n1,0,0,0,0,0,1\n2,1,0,"
+    for text in ("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 1 1\n", f"{table}0,0,1,1\n"):
+        file.write_text(text, encoding="utf-8")
+        where = f"line {len(text.splitlines())}: 0, 0, 1, 1 is not a unit quaternion"
+        with pytest.raises(InputError, match=where):
+            read_odometry(file)
+    file.write_text("timestamp (m),x (s),y (deg),yaw (m)\n1,0,0,0\n2,1,0,0\n", encoding="utf-8")
+    with pytest.raises(InputError, match=re.escape("the column 'timestamp (m)' has a unit that is not known here")):
+        read_odometry(file)
+    file.write_text("timestamp (s),x (m),y (m),yaw (rad)\n1,0,0,0\n2,1,0,2\n", encoding="utf-8")
+    assert read_odometry(file).at(1.5)[:3] == pytest.approx((0.5, 0.0, 1.0))
     # Eight columns are a table where there are commas.
     file.write_text("# timestamp,x,y,z,qx,qy,qz,qw\n1 ,0 ,0 ,0 ,0 ,0 ,0 ,1\n2 ,1 ,0 ,0 ,0 ,0 ,0 ,1\n", encoding="utf-8")
     assert read_odometry(file).at(1.5)[:3] == pytest.approx((0.5, 0.0, 0.0))

@@ -80,6 +80,7 @@ def _read(folder: Path, text: str, epsg: int | None = None, offset: float = 0.0)
         "EPSG:4326\na.jpg -2.2945 48.8582222222 35.5 0 0 0\n\nb.jpg 2.2945 -48.8582222222\n",
         "EPSG:4326\n# name,x,y,z\na.jpg,-2.2945,48.8582222222,35.5\nb.jpg,2.2945,-48.8582222222\n",
         "EPSG:4326\n# name, x, y\na.jpg -2.2945 48.8582222222 35.5\nb.jpg 2.2945 -48.8582222222\n",
+        "EPSG:4326\n# name, x, y\na.jpg -2,2945 48,8582222222 35,5\nb.jpg 2,2945 -48,8582222222\n",
         "\n# of flight 3\nEPSG:4326\na.jpg -2.2945 48.8582222222 35.5\nb.jpg 2.2945 -48.8582222222\n",
     ],
 )
@@ -139,12 +140,16 @@ def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> N
     assert three is None
     shifted = _read(tmp_path, GPX, offset=-20.0)
     assert [place is not None for place in shifted] == [False, True, True]
+    # A waypoint is no point of the track.
+    waypoint = '<wpt lat="46" lon="7"><time>2023-11-14T22:13:20Z</time></wpt>'
+    assert _read(tmp_path, GPX.replace("<trk>", f"{waypoint}<trk>")) == [one, two, three]
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "names no columns like name,latitude,longitude or name,x,y"),
+        ("name,lat,lon\n", "has no rows below its heading"),
         ("name,lat,lon\nz.jpg,1,2\n", "has no position of a.jpg"),
         ("name,lat,lon\na.jpg,1,2\na.jpg,1,2\n", "line 3: a.jpg is here twice"),
         ("name,lat,lon\na.jpg,91,2\n", "line 2: expected latitude and longitude in degrees, not 91 and 2"),
@@ -167,10 +172,17 @@ def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> N
             "line 2: expected a latitude like 33.85, -33.85 or 33 51 S",
         ),
         ("name,lat,lon\na.jpg,33.85 S,5 O\n", "line 2: expected a longitude like"),
+        ("name;lat;lon\na.jpg;33 75 00 S;5 E\n", "line 2: expected a latitude like"),
+        ("name;lat;lon\na.jpg;33 51 60 S;5 E\n", "line 2: expected a latitude like"),
+        ("name;lat;lon\na.jpg;48.5 30 N;5 E\n", "line 2: expected a latitude like"),
+        ("name;lat;lon\na.jpg;48 51 29 6 N;5 E\n", "line 2: expected a latitude like"),
+        ("name;lat;lon\na.jpg;48.8584, 2.2945;5 E\n", "line 2: expected a latitude like"),
         ("name,lat,lon\na.jpg,48,8582,2,2945\n", "line 2: has 5 fields"),
         ("name,lat,lon\na.jpg,1,2\nb.jpg,oops,2\n", "line 3: expected a number for latitude, not 'oops'"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg oops 5e6\n", "line 3: expected a name and numbers between blanks, not 'b"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 500000m 5e6 100 0\n", "line 3: expected a name and numbers between blanks"),
+        ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 5e5 5e6 w/o 5 6\n", "line 3: expected a name and numbers between blanks"),
+        ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg x y w/o 5 6\n", "line 3: expected a name and numbers between blanks"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 5e5 oops 100\n", "line 3: expected a name and numbers between blanks"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 5e5 5e6 1OO 0\n", "line 3: expected a name and numbers between blanks"),
         ("EPSG:32633\na.jpg 5e5 5e6 9 0 0 0 .02m .04\n", "line 2: expected a name and numbers between blanks"),
@@ -206,17 +218,32 @@ def test_control_points(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "lines",
+    ("lines", "name"),
     [
-        "# x, y, z, px, py, image\n500000 5300000 5 30 20 a.jpg",
-        "500000\t5300000\t5\t30\t20\ta.jpg",
-        "# x;y;px;py;image\n500000;5300000;30;20;a.jpg",
+        ("# x, y, z, px, py, image\n500000 5300000 5 30 20 a.jpg", "500000 5300000"),
+        (
+            "# x, y, z, px, py, image\n500000 5300000 5 30,0 20 a.jpg\n500010,5 5300000 5 1,125 20 elsewhere, b.jpg",
+            "500000 5300000",
+        ),
+        ("# x, y, z of Bob\n500000 5300000 5 30 20 a.jpg corner, NE", "corner, NE"),
+        ("500000\t5300000\t5\t30\t20\ta.jpg", "500000 5300000"),
+        ("# x;y;px;py;image\n500000;5300000;30;20;a.jpg", "500000 5300000"),
     ],
 )
-def test_a_list_of_control_points_is_told_from_a_table(tmp_path: Path, lines: str) -> None:
+def test_a_list_of_control_points_is_told_from_a_table(tmp_path: Path, lines: str, name: str) -> None:
     (tmp_path / "gcp").write_text(f"EPSG:32632\n{lines}\n", encoding="utf-8")
     (point,) = with_ground_control(_sources(), tmp_path / "gcp")[0].control
-    assert (point.name, point.pixel) == ("500000 5300000", (30.0, 20.0))
+    assert (point.name, point.pixel) == (name, (30.0, 20.0))
+
+
+def test_latitude_and_longitude_are_what_they_are_whatever_system_a_list_names(tmp_path: Path) -> None:
+    rows = "image,latitude,longitude,px,py,label\na.jpg,46.2,7.1,30,20,1\nb.jpg,46 12 0 N,7.1,30,20,2\n"
+    (tmp_path / "gcp").write_text(f"EPSG:32632\n{rows}", encoding="utf-8")
+    one, two, _ = (source.control for source in with_ground_control(_sources(), tmp_path / "gcp"))
+    assert [(c.place.latitude, c.place.longitude, c.epsg) for c in (*one, *two)] == [(46.2, 7.1, 4326)] * 2
+    (tmp_path / "gcp").write_text(f"{rows}c.jpg,,7.1,30,20,3\n", encoding="utf-8")
+    with pytest.raises(InputError, match="line 4: has no coordinates"):
+        with_ground_control(_sources(), tmp_path / "gcp")
 
 
 def test_projected_numbers_in_other_notations_and_zero_longitude(tmp_path: Path) -> None:
@@ -304,6 +331,36 @@ def test_control_points_as_a_table_with_accuracies(tmp_path: Path) -> None:
     assert with_ground_control(_sources(), tmp_path / "plain.csv", 32734)[0].control == one
     with pytest.raises(InputError, match="--crs"):
         with_ground_control(_sources(), tmp_path / "plain.csv")
+
+
+def test_names_in_lists_hold_blanks_and_words_follow_the_numbers(tmp_path: Path) -> None:
+    lines = [
+        "DJI 0001 (2).jpg 12.5 48 -3",
+        "# no\n\nb.jpg 1 2",
+        "c.jpg 1 2 3 4 5 6 7 8 fixed 30 sats",
+        "d.jpg 1 2 RTK",
+        "v1.old shots/IMG1 1 2",
+        "IMG 2024 01 15 x.jpg 1 2 3 fixed",
+    ]
+    (tmp_path / "geo.txt").write_text("EPSG:4326\n" + "\n".join(lines))
+    names = ("DJI 0001 (2).jpg", "b.jpg", "c.jpg", "d.jpg", "IMG1", "IMG 2024 01 15 x.jpg")
+    sources = [Source(Path(name), Metadata((640, 480)), Camera((640, 480))) for name in names]
+    places = [source.metadata.gps for source in with_positions(sources, tmp_path / "geo.txt")]
+    assert [place and (place.longitude, place.latitude, place.altitude) for place in places] == [
+        (12.5, 48.0, -3.0),
+        (1.0, 2.0, None),
+        (1.0, 2.0, 3.0),
+        (1.0, 2.0, None),
+        (1.0, 2.0, None),
+        (1.0, 2.0, 3.0),
+    ]
+
+
+@pytest.mark.parametrize("name", ["IMG 2024 01 15 a.jpg", "a,b.jpg"])
+def test_tables_below_a_comment_hold_any_name(tmp_path: Path, name: str) -> None:
+    (tmp_path / "p").write_text(f'EPSG:4326\n# name,x,y\n"{name}",1,2\n'.replace('"', '"' if "," in name else ""))
+    (source,) = with_positions([Source(Path(name), Metadata((64, 48)), Camera((64, 48)))], tmp_path / "p")
+    assert source.metadata.gps == GpsPosition(2.0, 1.0)
 
 
 def test_positions_that_tell_no_accuracy_get_the_one_given(tmp_path: Path) -> None:
