@@ -7,16 +7,19 @@ modulus of the complex scale is the height of the camera, its angle how the came
 
 import cmath
 import math
+from bisect import bisect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
-from rdstitch.inputs.odometry import BodyPose, motion_between
+from rdstitch.inputs.odometry import BodyMotion, BodyPose, motion_between
+from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 
 _EXACT = 1e-6  # of the longest step: no odometry is more exact, whatever it states
 _WHEELS = 0.01  # relative standard deviation of what all distances share: the size of the wheels
@@ -34,14 +37,14 @@ class Motion(NamedTuple):
     variance: float  # of a coordinate of the body's displacement
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OdometryFit:
     """How a camera is mounted on a body whose odometry is known."""
 
     scale: complex  # units of the odometry for one of the path; its angle is that of the camera on the body
     lever: complex  # the camera's place on the body
     noise: float  # factor of the stated standard deviations that the path shows
-    relative_std: float  # of the scale
+    covariance: NDArray[np.complex128]  # (2, 2): of scale and lever, of their real as of their imaginary parts
 
     @classmethod
     def of(cls, motions: Sequence[Motion]) -> "OdometryFit | None":
@@ -61,17 +64,40 @@ class OdometryFit:
             normal = by @ design + prior
             solution = np.linalg.solve(normal, by @ body)
             errors = np.abs(body - design @ solution) * np.sqrt(weight)
-            noise = max(float(np.median(errors)) / math.sqrt(math.log(2.0)), 1e-9)
+            noise = max(float(np.median(errors)) / RAYLEIGH_MEDIAN, 1e-9)
             rest = np.minimum(1.0, _HUBER * noise / np.maximum(errors, 1e-300))
         scale, lever = complex(solution[0]), complex(solution[1])
         if not abs(scale) > 0.0:
             return None
-        deviation = math.sqrt(float(np.linalg.inv(normal)[0, 0].real) / 2.0) * max(noise, 1.0)
-        return cls(scale, lever, max(noise, 1.0), math.hypot(deviation / abs(scale), _WHEELS))
+        noise = max(noise, 1.0)
+        return cls(scale, lever, noise, noise**2 * np.linalg.inv(normal).astype(np.complex128))
 
-    def camera_motion(self, body: complex, turn: float) -> complex:
-        """How far the camera moves, in its own axes and in units of the path."""
-        return (body + (cmath.exp(1j * turn) - 1.0) * self.lever) / self.scale
+    @property
+    def length_std(self) -> float:
+        """Relative standard deviation of lengths by the odometry."""
+        return math.hypot(math.sqrt(self.covariance[0, 0].real) / abs(self.scale), _WHEELS)
+
+    def moved(self, yaw: float, step: BodyMotion) -> tuple[complex, FloatArray, FloatArray]:
+        """How far the camera moves from a frame of this yaw: on the plane, x to the right and y to the top.
+
+        With the derivative (4, 4) of the new x, y (to the bottom), height and yaw by those of the frame, and the
+        covariance (4, 4) that the step adds, but for the size of the wheels.
+        """
+        turned, heading = cmath.exp(1j * step.turn), cmath.exp(1j * yaw)
+        camera = (step.moved + (turned - 1.0) * self.lever) / self.scale
+        way = heading * camera
+        by_fit = np.array([camera, 1.0 - turned]) / abs(self.scale)
+        # What a body turns otherwise than its wheels say is a random walk: as a turn halfway, and a twelfth besides.
+        bent = step.turn_variance * abs(step.moved) ** 2 / 12.0
+        variance = (self.noise / abs(self.scale)) ** 2 * (step.variance + bent)
+        variance += float((by_fit @ self.covariance @ by_fit.conj()).real)
+        by_turn = 1j * heading * (turned * self.lever + step.moved / 2.0) / self.scale
+        along_turn = np.array([by_turn.real, -by_turn.imag, 0.0, 1.0])
+        added = np.diag([variance, variance, 0.0, 0.0])
+        added += self.noise**2 * step.turn_variance * np.outer(along_turn, along_turn)
+        carried = np.eye(4)
+        carried[:2, 3] = -way.imag, -way.real
+        return way, carried, added
 
 
 def motions_of(poses: Sequence[tuple[complex, float, BodyPose | None]]) -> list[Motion]:
@@ -85,35 +111,46 @@ def motions_of(poses: Sequence[tuple[complex, float, BodyPose | None]]) -> list[
     return motions
 
 
-def scaled_by_odometry(
-    path: Trajectory, bodies: Sequence[BodyPose | None], *, keep_unit: bool
+def along_odometry(
+    path: Trajectory, bodies: Mapping[int, BodyPose], length_std: float, *, keep_unit: bool
 ) -> tuple[Trajectory, OdometryFit] | None:
-    """A path in the unit of the odometry, by that of each frame, and how they are related; None where they are not."""
+    """A path in the unit of the odometry, unless its own is kept, with poses of all frames that the odometry leads to.
+
+    ``bodies``: by the number of the frame; ``length_std``: relative standard deviation that all lengths of the path
+    share. None where the odometry shows no motion of the frames.
+    """
     places = (path.position @ np.array([1.0, -1.0j])).tolist()
-    fit = OdometryFit.of(motions_of(list(zip(places, path.yaw.tolist(), bodies, strict=True))))
+    known = [bodies.get(frame) for frame in path.frame.tolist()]
+    fit = OdometryFit.of(motions_of(list(zip(places, path.yaw.tolist(), known, strict=True))))
     if fit is None:
         return None
-    if keep_unit:
-        return path, fit
-    unit = abs(fit.scale)
-    covariance = path.covariance
+    if path.covariance is not None:
+        each = zip(path.covariance, path.position, strict=True)
+        path = replace(path, covariance=np.array([_without_length(one, place, length_std) for one, place in each]))
+    if not keep_unit:
+        path, fit, length_std = *_in_unit_of(fit, path), fit.length_std
+    path = bridged(path, bodies, fit)
+    if path.covariance is not None:
+        path.covariance[:, :2, :2] += length_std**2 * path.position[:, :, None] * path.position[:, None]
+    return path, fit
+
+
+def _in_unit_of(fit: OdometryFit, path: Trajectory) -> tuple[Trajectory, OdometryFit]:
+    """The path in the unit of the odometry."""
+    unit, covariance = abs(fit.scale), path.covariance
     if covariance is not None:
-        change = np.diag([unit, unit, unit, 1.0])
-        known = zip(change @ covariance @ change, unit * path.position, strict=True)
-        covariance = np.array([_with_length(one, place, fit.relative_std) for one, place in known])
+        covariance = covariance * np.outer(change := np.array([unit, unit, unit, 1.0]), change)
     scaled = replace(path, position=path.position * unit, height=path.height * unit, covariance=covariance)
-    return scaled, replace(fit, scale=fit.scale / unit)
+    by_unit = np.diag([1.0 / unit, 1.0])
+    return scaled, replace(fit, scale=fit.scale / unit, covariance=by_unit @ fit.covariance @ by_unit)
 
 
-def _with_length(covariance: FloatArray, place: FloatArray, relative_std: float) -> FloatArray:
-    """The covariance (4, 4) of a pose whose distance from the first one is also known relatively so well."""
-    far = float(np.hypot(*place))
-    along = np.zeros(4)
-    along[:2] = place / max(far, 1e-300)
+def _without_length(covariance: FloatArray, place: FloatArray, length_std: float) -> FloatArray:
+    """The covariance (4, 4) of a pose by all but the length that it shares with others."""
+    along = np.array([*place, 0.0, 0.0])
     moved = covariance @ along
-    spread = float(along @ moved)
-    known = (relative_std * far) ** 2
-    return covariance if spread <= known else covariance - np.outer(moved, moved) * (1.0 - known / spread) / spread
+    spread, shared = float(along @ moved), length_std**2 * float(place @ place) ** 2
+    return covariance - np.outer(moved, moved) * min(shared / spread, 1.0) / spread if spread > 0.0 else covariance
 
 
 class _Prediction(NamedTuple):
@@ -122,9 +159,8 @@ class _Prediction(NamedTuple):
     place: complex
     yaw: float
     height: float
-    variance: float  # of a coordinate of the place
-    yaw_variance: float
-    row: int  # of the other frame in the path
+    carried: FloatArray  # carried, added: (4, 4), covariances by that of the other frame, and by the way from it
+    added: FloatArray
 
 
 def bridged(path: Trajectory, bodies: Mapping[int, BodyPose], fit: OdometryFit) -> Trajectory:
@@ -137,15 +173,14 @@ def bridged(path: Trajectory, bodies: Mapping[int, BodyPose], fit: OdometryFit) 
 
     def prediction(start: int, number: int) -> _Prediction:
         k, step = known[start], motion_between(bodies[start], bodies[number])
-        place = places[k] + cmath.exp(1j * path.yaw[k]) * fit.camera_motion(step.moved, step.turn)
-        yaw_variance = fit.noise**2 * step.turn_variance
-        variance = fit.noise**2 * step.variance + yaw_variance * abs(step.moved) ** 2
-        return _Prediction(place, path.yaw[k] + step.turn, path.height[k], variance, yaw_variance, k)
+        way, carried, added = fit.moved(path.yaw[k], step)
+        covariance = carried @ covariances[k] @ carried.T
+        return _Prediction(places[k] + way, path.yaw[k] + step.turn, path.height[k], covariance, added)
 
     for number in bodies.keys() - known.keys():
-        ends = [*[n for n in seen if n < number][-1:], *[n for n in seen if n > number][:1]]
-        if ends:
-            rows[number] = _combined([prediction(end, number) for end in ends], covariances)
+        after = bisect(seen, number)
+        if ends := [*seen[:after][-1:], *seen[after : after + 1]]:
+            rows[number] = _combined([prediction(end, number) for end in ends])
     frame = sorted(rows)
     at, yaw, height, covariance = zip(*(rows[number] for number in frame), strict=True)
     return replace(
@@ -158,13 +193,13 @@ def bridged(path: Trajectory, bodies: Mapping[int, BodyPose], fit: OdometryFit) 
     )
 
 
-def _combined(predictions: Sequence[_Prediction], covariances: FloatArray) -> tuple[complex, float, float, FloatArray]:
+def _combined(predictions: Sequence[_Prediction]) -> tuple[complex, float, float, FloatArray]:
     """Place, yaw, height and covariance (4, 4) by predictions of one frame, whose yaws differ by whole turns."""
-    weights = np.array([1.0 / max(one.variance, 1e-12) for one in predictions])
+    weights = np.array([1.0 / max(np.trace(one.added[:2, :2]), 1e-12) for one in predictions])
     weights /= weights.sum()
     yaws = np.unwrap([one.yaw for one in predictions])
     place = complex(weights @ np.array([one.place for one in predictions]))
     height = float(weights @ np.array([one.height for one in predictions]))
     best, weight = predictions[int(np.argmax(weights))], float(weights.max())
-    own = weight * np.diag([best.variance, best.variance, 0.0, best.yaw_variance])
-    return place, float(weights @ yaws), height, covariances[best.row] + own
+    # What lies before both ends, they share.
+    return place, float(weights @ yaws), height, best.carried + weight * best.added

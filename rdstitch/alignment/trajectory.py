@@ -52,6 +52,11 @@ class Trajectory:
     timestamp: FloatArray | None = None
     covariance: FloatArray | None = None
 
+    def __post_init__(self) -> None:
+        counts = {len(values) for values in vars(self).values() if values is not None and len(values)}
+        if len(counts) > 1:
+            raise ArgumentError(f"a trajectory has one value of each kind a frame, not {sorted(counts)} of them")
+
     def labelled(self, names: Sequence[str], numbers: ArrayLike, timestamps: ArrayLike) -> Self:
         """The same with name, number and time stamp of each image of the whole sequence."""
         chosen = self.frame

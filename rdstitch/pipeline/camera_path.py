@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
-from rdstitch.alignment.odometry import bridged, scaled_by_odometry
+from rdstitch.alignment.odometry import along_odometry
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame, Named
@@ -41,13 +41,14 @@ def camera_path(
     stored = QuarterTurns.of(sources).back.alignment(registration.alignment)
     path = Trajectory.from_alignment(stored, height or 1.0)
     if odometry is not None:
-        path, messages = _along_odometry(path, sources, odometry, keep_unit=height is not None)
+        length_std = registration.alignment.length_std
+        path, messages = _along_odometry(path, sources, odometry, length_std, keep_unit=height is not None)
     numbers = [source.number(k) for k, source in enumerate(sources)]
     return path.labelled([source.name for source in sources], numbers, timestamps_of(sources)), messages
 
 
 def _along_odometry(
-    path: Trajectory, sources: Sequence[Source], given: Odometry | str | Path, *, keep_unit: bool
+    path: Trajectory, sources: Sequence[Source], given: Odometry | str | Path, length_std: float, *, keep_unit: bool
 ) -> tuple[Trajectory, list[Message]]:
     """The path in the unit of the odometry, unless that is to be kept, with poses of all frames that it leads to."""
     odometry = given if isinstance(given, Odometry) else read_odometry(given)
@@ -59,13 +60,12 @@ def _along_odometry(
         seen = times[np.isfinite(times)]
         of = f"those of the images are from {seen.min():.3f} to {seen.max():.3f} s" if len(seen) else "images have none"
         raise InputError(f"{name}: has times from {first:.3f} to {last:.3f} s, {of}; give --timestamps")
-    scaled = scaled_by_odometry(path, [found.get(int(k)) for k in path.frame], keep_unit=keep_unit)
-    if scaled is None:
+    along = along_odometry(path, found, length_std, keep_unit=keep_unit)
+    if along is None:
         return path, [Message(f"{name}: shows no motion of the images that have a pose; it is not used")]
-    path, fit = scaled
-    whole, messages = bridged(path, found, fit), []
+    (whole, fit), messages = along, list[Message]()
     if not keep_unit:
-        text = f"lengths are those of the odometry, ± {fit.relative_std:.1%}: the camera is at {path.height[0]:.4g}"
+        text = f"lengths are those of the odometry, ± {fit.length_std:.1%}: the camera is at {whole.height[0]:.4g}"
         messages.append(Message(text, severity="note"))
     seen_frames = set(path.frame.tolist())
     if added := [sources[k].name for k in whole.frame.tolist() if k not in seen_frames]:

@@ -5,12 +5,9 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
-
 from rdstitch.alignment.odometry import OdometryFit, motions_of
 from rdstitch.inputs.odometry import motion_between
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
-from rdstitch.tracking.metric_plane import chained
 from rdstitch.tracking.placement import PlaneSimilarity
 from rdstitch.tracking.tracked_frame import Frame, TrackedFrame
 
@@ -27,7 +24,7 @@ class OdometryPrediction:
     @property
     def unit(self) -> tuple[float, float]:
         """Height of the first keyframe in units of the odometry, and its relative standard deviation."""
-        return (math.nan, math.nan) if self.mounted is None else (abs(self.mounted.scale), self.mounted.relative_std)
+        return (math.nan, math.nan) if self.mounted is None else (abs(self.mounted.scale), self.mounted.length_std)
 
     def learn(self, keyframes: Iterable[TrackedFrame]) -> None:
         """How the camera is mounted, by the keyframes of a map that images have placed."""
@@ -49,14 +46,13 @@ class OdometryPrediction:
         if was is None or last.covariance is None:
             return None
         step = motion_between(last.frame.body, frame.body)
-        moved = cmath.exp(1j * was.yaw) * fit.camera_motion(step.moved, step.turn)
-        place, yaw = complex(was.x, was.y) + moved.conjugate(), was.yaw + step.turn
+        way, carried, added = fit.moved(was.yaw, step)
+        place, yaw = complex(was.x, was.y) + way.conjugate(), was.yaw + step.turn
         below = knowledge.plane.below(last.placement.camera, knowledge.attitude(frame))
-        spread = fit.noise**2 * np.array([step.variance / abs(fit.scale) ** 2] * 2 + [0.0, step.turn_variance])
         return TrackedFrame(
             frame,
             PlaneSimilarity(was.height * cmath.exp(-1j * yaw), place).applied(below),
             True,
-            chained(last.covariance, np.diag(spread), (moved.real, -moved.imag), was.height),
+            carried @ last.covariance @ carried.T + added,
             predicted=True,
         )

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import rdstitch
 from examples.worlds.floor_drives import DISTORTION, floor_drive, true_path
-from rdstitch.alignment.odometry import OdometryFit, bridged, motions_of, scaled_by_odometry
+from rdstitch.alignment.odometry import OdometryFit, along_odometry, bridged, motions_of
 from rdstitch.alignment.trajectory import Trajectory
-from rdstitch.errors import InputError
+from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.odometry import BodyPose, read_odometry
 from rdstitch.synthetic import Sequence
@@ -46,13 +47,13 @@ def test_the_scale_and_the_mount_are_found_as_well_as_it_says() -> None:
     for seed in range(20):
         path = _path(seed)
         metres = replace(path, position=path.position * HEIGHT)
-        found = scaled_by_odometry(path, list(_bodies(metres, 0.02, seed)), keep_unit=False)
+        found = along_odometry(path, dict(enumerate(_bodies(metres, 0.02, seed))), 0.0, keep_unit=False)
         assert found is not None
         scaled, fit = found
-        errors.append((scaled.height[0] / HEIGHT - 1.0) / np.sqrt(fit.relative_std**2 - 0.01**2))
+        errors.append((scaled.height[0] / HEIGHT - 1.0) / np.sqrt(fit.length_std**2 - 0.01**2))
         assert abs(fit.lever - LEVER) < 0.05
         assert fit.scale == pytest.approx(MOUNT, abs=0.05)
-        assert 0.01 < fit.relative_std < 0.03
+        assert 0.01 < fit.length_std < 0.03
     assert 0.3 < np.mean(np.square(errors)) < 2.5
     assert OdometryFit.of([]) is None
 
@@ -65,24 +66,74 @@ def test_motions_without_a_variance_count_alike() -> None:
     fit = OdometryFit.of([motion._replace(variance=0.0) for motion in motions])
     assert fit is not None
     assert abs(fit.scale) == pytest.approx(HEIGHT, rel=0.05)
-    assert 0.01 < fit.relative_std < 0.03
+    assert 0.01 < fit.length_std < 0.03
 
 
-def test_frames_without_texture_get_their_poses() -> None:
-    whole = _path()
-    metres = replace(whole, position=whole.position * HEIGHT, height=whole.height * HEIGHT)
-    bodies = dict(enumerate(_bodies(metres, 0.01)))
-    seen = np.r_[0:15, 20:35]
-    shown = Trajectory(seen, whole.position[seen], whole.yaw[seen], whole.height[seen], covariance=np.zeros((30, 4, 4)))
-    found = scaled_by_odometry(shown, [bodies[int(k)] for k in seen], keep_unit=False)
-    assert found is not None
-    path = bridged(found[0], bodies, found[1])
-    assert path.frame.tolist() == list(range(40))
-    assert np.abs(path.position - metres.position)[:35].max() < 0.03
-    assert path.covariance is not None
-    off = np.linalg.norm(path.position - metres.position * path.height[0] / HEIGHT, axis=1)
-    assert (off < 4.0 * np.sqrt(np.trace(path.covariance[:, :2, :2], axis1=1, axis2=2)) + 0.004).all()
-    assert path.covariance[38, 0, 0] > path.covariance[36, 0, 0] > 0.0
+def _seen_and_stated(
+    seed: int, seen: NDArray[np.intp], length_std: float, yaw_std: float, slip: float, turn_std: float
+) -> tuple[Trajectory, Trajectory, dict[int, BodyPose]]:
+    """A path in metres, what images say of some of its frames, in heights, and what wheels say.
+
+    Each is as exact as stated, but for the size of the wheels, which is off by 1 %.
+    """
+    rng, place_std = np.random.default_rng(seed), 0.003
+    true = _path(seed)
+    count = len(true)
+    metres = replace(true, position=HEIGHT * true.position, height=HEIGHT * true.height)
+    body = metres.position @ [1.0, -1.0j] * MOUNT - LEVER * np.exp(1j * true.yaw)
+    steps = np.diff(body) * np.exp(-1j * true.yaw[:-1]) + slip * (rng.normal(size=(count - 1, 2)) @ [1.0, 1.0j])
+    turns = np.append(0.0, np.cumsum(np.diff(true.yaw) + turn_std * rng.normal(size=count - 1)))
+    wheels = 1.0 + 0.01 * rng.normal()
+    places = wheels * np.append(0.0, np.cumsum(steps * np.exp(1j * turns[:-1])))
+    bodies = {
+        k: BodyPose(place.real, place.imag, turn, slip**2 * (k + 1), turn_std**2 * (k + 1))
+        for k, (place, turn) in enumerate(zip(places.tolist(), turns.tolist(), strict=True))
+    }
+    moves = (seen > 0).astype(float)  # all poses are relative to the first
+    found = true.position[seen] + place_std * moves[:, None] * rng.normal(size=(len(seen), 2))
+    found *= 1.0 + length_std * rng.normal()
+    covariance = np.zeros((len(seen), 4, 4))
+    covariance[:, :2, :2] = place_std**2 * np.eye(2) + length_std**2 * found[:, :, None] * found[:, None]
+    covariance[:, 3, 3] = yaw_std**2
+    covariance[0] = 0.0
+    yaw = true.yaw[seen] + yaw_std * moves * rng.normal(size=len(seen))
+    return metres, Trajectory(seen, found, yaw, true.height[seen], covariance=covariance), bodies
+
+
+@pytest.mark.parametrize(
+    ("keep_unit", "stated"),  # stated: of all lengths by images and of their yaw; of a step and a turn by the wheels
+    [
+        (False, (0.002, 0.03, 0.002, 0.0005)),
+        (True, (0.03, 0.002, 0.002, 0.02)),
+        (False, (0.03, 0.002, 0.01, 0.0005)),
+        (True, (0.002, 0.01, 0.004, 0.002)),
+    ],
+)
+@pytest.mark.parametrize("seen", [np.r_[0:20, 30:40], np.r_[0:30]], ids=["between", "after"])
+def test_covariances_are_right_of_frames_with_texture_and_without(
+    seen: NDArray[np.intp], keep_unit: bool, stated: tuple[float, float, float, float]
+) -> None:
+    squares = []
+    for seed in range(60):
+        metres, shown, bodies = _seen_and_stated(seed, seen, *stated)
+        found = along_odometry(shown, bodies, stated[0], keep_unit=keep_unit)
+        assert found is not None
+        path = found[0]
+        assert path.frame.tolist() == list(range(40))
+        assert path.covariance is not None
+        unit = HEIGHT if keep_unit else 1.0
+        off = np.column_stack([path.position - metres.position / unit, path.yaw - metres.yaw])[1:]
+        known = path.covariance[1:][:, [[0], [1], [3]], [0, 1, 3]]
+        squares.append(np.einsum("ni,ni->n", off, np.linalg.solve(known, off[..., None])[..., 0]) / 3.0)
+    of_each = np.mean(squares, axis=0)
+    bridge = np.isin(np.arange(1, 40), seen, invert=True)
+    assert 0.6 < of_each[bridge].mean() < 1.5
+    assert 0.6 < of_each[~bridge].mean() < 1.5
+
+
+def test_a_path_has_a_value_of_each_kind_a_frame() -> None:
+    with pytest.raises(ArgumentError, match="one value of each kind a frame"):
+        replace(_path(), name=("a.png", "b.png"))
 
 
 @pytest.fixture(scope="module")
@@ -172,4 +223,6 @@ def test_turns_by_more_than_half_a_circle_are_bridged_the_way_they_were_made() -
     bodies = {k: BodyPose(0.0, 0.0, turn) for k, turn in enumerate(yaw.tolist())}
     for last in (yaw[-1], yaw[-1] - 2.0 * np.pi):  # images alone know it up to whole turns
         path = Trajectory(np.array([0, 4]), np.zeros((2, 2)), np.array([0.0, last]), np.ones(2))
-        np.testing.assert_allclose(bridged(path, bodies, OdometryFit(1.0, 0.0, 1.0, 0.01)).yaw, yaw)
+        np.testing.assert_allclose(
+            bridged(path, bodies, OdometryFit(1.0, 0.0, 1.0, np.zeros((2, 2), dtype=np.complex128))).yaw, yaw
+        )
