@@ -17,8 +17,8 @@ from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.noise import Coherence, coherence, evidence_of
 from rdstitch.alignment.pairwise import pairwise_homographies
 from rdstitch.arrays import BoolArray
-from rdstitch.geometry.camera import LENS_PARAMETERS, LENS_STD
-from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, Prior, of_each
+from rdstitch.geometry.camera import LENS_PARAMETERS
+from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, prior_costs
 
 LENSES: dict[str, tuple[str, ...]] = {
     "division": ("distortion",),
@@ -148,9 +148,10 @@ def _score(evidence: Evidence, observations: Observations, fit: BundleAdjustment
     lens, free = fit.parameters.lens, fit.adjuster.free.lens
     seen = evidence.cost(fit.errors)
     shared = 2.0 * len(observations.points1) / float(seen.count[0])
-    relative = fit.covariance * shared / np.outer(LENS_STD[free], LENS_STD[free])
+    core = np.array([prior.parts[0][2] for prior in LENS])[free]
+    relative = fit.covariance * shared / np.outer(core, core)
     narrowed = -np.log(np.clip(np.linalg.eigvalsh(relative), 1e-300, 1.0)).sum()
-    return float(seen.cost[0] + of_each(Prior.cost, LENS, lens).sum() + narrowed)
+    return float(seen.cost[0] + prior_costs(LENS, lens).sum() + narrowed)
 
 
 def _reason(names: Sequence[str], fits: Sequence[BundleAdjustmentResult], best: int) -> str:
