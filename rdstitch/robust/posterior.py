@@ -2,8 +2,7 @@
 
 ``score = -2 log L(errors) - 2 log p(camera) + cost of freedom``, the smaller the better: how likely the errors are, how
 far the camera is off from what cameras are, and what the parameters cost: ``log n`` each by so many independent
-observations (Schwarz's approximation), or, where the posterior of a parameter is at hand, the logarithm of how many
-times narrower than its prior that is (Laplace's).
+observations (Schwarz's approximation).
 
 Errors are noise of the keypoints, and parts that neighbours share: depth, relief, or a lens of another kind move all
 points of a part of an overlap together. The errors ``e`` of a link are therefore taken as ``noise + field``, the field
@@ -167,16 +166,6 @@ def overlap_cells(link: IntArray, points: FloatArray, count: int, side: int) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class ErrorCost:
-    """What the errors of G problems say of a hypothesis, each array (G,)."""
-
-    cost: FloatArray  # -2 log of their likelihood, up to a constant of the problem, with what parameters cost
-    field: FloatArray  # size of what neighbours share, pixels of a coordinate
-    # independent coordinates: all where there is noise only, a pair of them a cell or block where the field is large
-    count: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class Evidence:
     """Cells of the overlaps of links, by which hypotheses on the same matches are compared, for G problems at once."""
 
@@ -216,8 +205,19 @@ class Evidence:
             np.ones(len(noise)) if weight is None else weight,
         )
 
-    def cost(self, errors: FloatArray, parameters: int = 0) -> ErrorCost:
-        """How likely errors (M, 2), pixels, are that so many parameters leave, with the fields that are likeliest."""
+    def score(self, errors: FloatArray, parameters: int, priors: FloatArray | float = 0.0) -> FloatArray:
+        """-2 log of the posterior of a hypothesis on each problem (G,), up to a constant of the problem.
+
+        By the errors (M, 2), pixels, that so many parameters leave, and what these cost by their priors (G,).
+        """
+        return self._with_likeliest_field(errors, parameters)[0] + priors
+
+    def field(self, errors: FloatArray) -> FloatArray:
+        """Size of what neighbours share of errors (M, 2), pixels of a coordinate, (G,), whatever freedom costs."""
+        return self._with_likeliest_field(errors, 0)[1]
+
+    def _with_likeliest_field(self, errors: FloatArray, parameters: int) -> tuple[FloatArray, FloatArray]:
+        """What errors and parameters cost with the fields that make that least, and how large these are."""
         group, groups = self.group[self.block], len(self.noise)
         length, farthest = np.linalg.norm(errors, axis=1), self.farthest[group[self.cell]]
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -228,7 +228,7 @@ class Evidence:
         squared = np.einsum("ck,ck->c", mean, mean)
         sizes = np.geomspace(MODEL_ERROR, np.maximum(self.farthest, 2.0 * MODEL_ERROR), _SIZES)
         coarse = np.concatenate([np.zeros((1, groups)), sizes])
-        tried = list[tuple[FloatArray, FloatArray, FloatArray]]()
+        tried = list[tuple[FloatArray, FloatArray]]()
         for fine in sizes:
             # A cell's mean error has the variance of its noise and of its own field; blocks of cells share another one.
             variance = (fine**2)[group] + (self.noise**2)[group] / self.counts
@@ -241,15 +241,16 @@ class Evidence:
             # Of normal variables: log det Σ + r' Σ⁻¹ r, by cells with the blocks' fields taken out (Woodbury).
             of_cells = np.bincount(group, 2.0 * np.log(variance) + squared / variance, groups)
             fields = np.hypot(fine, coarse)
-            # Independent coordinates: the information that is left, in units of what one coordinate would have.
+            # Independent coordinates: the information that is left, in units of what one coordinate would have. All
+            # where there is noise only, a pair of them a cell or block where the field is large.
             left = np.stack([np.bincount(self.group, each, groups) for each in information / grown])
             counts = np.maximum(2.0 * self.weight * (fields**2 + self.noise**2) * left, 2.0)
             costs = np.stack([np.bincount(self.group, each, groups) for each in of_blocks])
             costs = self.weight * (of_cells + costs) + parameters * np.log(counts)
-            tried.append((costs, fields, counts))
-        costs, fields, counts = map(np.concatenate, zip(*tried, strict=True))
+            tried.append((costs, fields))
+        costs, fields = map(np.concatenate, zip(*tried, strict=True))
         least = np.argmin(costs, axis=0), np.arange(groups)
-        return ErrorCost(costs[least], fields[least], counts[least])
+        return costs[least], fields[least]
 
 
 def farthest_error(scale: FloatArray) -> FloatArray:
