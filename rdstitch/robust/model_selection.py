@@ -98,13 +98,6 @@ class ModelSelection:
                 free = index == len(planar)
                 why = f"{'no model with less freedom' if free else 'the least free model that'} explains the data"
                 result.update(finished(index, rows, why))
-        # A camera that turns on the spot moves like one beside a plane seen edge on, where tilt, focal length and λ
-        # cannot be distinguished; as a free homography the same images may show λ well.
-        unseen = [row for row, fit in result.items() if chosen[row] < len(planar) and np.isinf(fit.distortion_std)]
-        if unseen:
-            why = "models with less freedom explain the data, and do not show λ"
-            free_fits = finished(len(planar), np.array(sorted(unseen), dtype=np.intp), why)
-            result.update({row: fit for row, fit in free_fits.items() if np.isfinite(fit.distortion_std)})
         return [result[row] for row in range(len(pairs.data))]
 
     def _problems(self, model: PairModel, pairs: StartedPairs) -> PairProblems:
