@@ -1,1 +1,1 @@
-"""What other programs read: georeferences and drawings."""
+"""What other programs read: poses, places, layers, a map of ROS, a project of Hugin, drawings."""

@@ -1,7 +1,7 @@
 """A mosaic as a map of ROS: the image and the ``map.yaml`` that ``nav2_map_server`` loads.
 
 The map lies in the frame "ros" of a trajectory of the same images: the first image's camera stands at the origin, x
-points to the top of that image and y to its left; see :mod:`rdstitch.export.trajectory_files`.
+points to the top of that image and y to its left; see :mod:`rdstitch.geometry.path_frames`.
 """
 
 import json
@@ -15,7 +15,7 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.plan import default_memory
 from rdstitch.errors import ArgumentError, LimitError
-from rdstitch.export.trajectory_files import AXES
+from rdstitch.geometry.path_frames import AXES
 from rdstitch.io import ImageSpec, write_strips
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import read_image

@@ -28,7 +28,7 @@ from rdstitch.system.late_imports import spatial
 def poses_table(result: StitchResult, frame: PosesFrame = "enu", height: float = 1.0) -> str:
     """The table that ``rdstitch trajectory`` writes, of a mosaic; with covariances where ``options`` asked for them.
 
-    Frames are those of :mod:`rdstitch.export.trajectory_files`, ``height`` that of the first image in the unit that
+    Frames are those of :mod:`rdstitch.geometry.path_frames`, ``height`` that of the first image in the unit that
     positions shall have; or "map": easting, northing and the height above the ground in metres, with yaw zero where the
     top of an image is north, and covariances relative to the reference image.
     """

@@ -1,18 +1,9 @@
 """Trajectories as files: a table, a drawing, and the formats of the TUM and KITTI benchmarks, which ``evo`` reads.
 
-The plane lies at z = 0; at the first frame x, y and yaw are zero. Four frames of reference, all right-handed:
-
-========= ============================================================= ==================
-"enu"     x to the right and y to the top of the first image, z up      the camera above 0
-"ros"     x to the top and y to the left of the first image, z up       the camera above 0
-"camera"  x to the right and y to the bottom of the first image, z down the camera below 0
-"first"   the same; a mosaic's sidecar and plane have it too            the camera below 0
-========= ============================================================= ==================
-
-The yaw, in all files, is the heading of the camera, counterclockwise as seen from above (as in ROS's REP 103): φ of
-:class:`Trajectory`. Orientations are those of the camera with its tilt removed, from its axes, which are those of the
-frame of reference when the yaw is zero, to the frame: a turn about z by the yaw where z points up, by minus the yaw
-where it points down.
+Frames of reference are those of :mod:`rdstitch.geometry.path_frames`. The yaw, in all files, is the heading of the
+camera, counterclockwise as seen from above (as in ROS's REP 103): φ of :class:`Trajectory`. Orientations are those of
+the camera with its tilt removed, from its axes, which are those of the frame of reference when the yaw is zero, to the
+frame: a turn about z by the yaw where z points up, by minus the yaw where it points down.
 """
 
 import csv
@@ -24,17 +15,7 @@ import numpy as np
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import TrajectoryFrame
-
-AXES: dict[TrajectoryFrame, FloatArray] = {
-    "enu": np.array([[1.0, 0.0], [0.0, -1.0]]),
-    "camera": np.eye(2),
-    "first": np.eye(2),
-    "ros": np.array([[0.0, -1.0], [-1.0, 0.0]]),
-}
-"""x and y by those of the first image, to its right and its bottom."""
-
-NOT_MEASURED = 1e6
-"""Variance that programs of ROS take for "not measured"."""
+from rdstitch.geometry.path_frames import AXES, covariance_in_frame, in_frame, turn_about_z
 
 _SIDE = 800.0  # pixels of the drawing's longer side
 _MARGIN = 60.0  # pixels
@@ -81,37 +62,6 @@ def frame_of(layout: str) -> TrajectoryFrame:
     return axes.get(layout, "enu")
 
 
-def in_frame(x: float, y: float, frame: TrajectoryFrame) -> tuple[float, float]:
-    """Coordinates x and y in a frame of reference, given in the axes of the first image."""
-    there = AXES[frame] @ (x, y) + 0.0  # no minus zero
-    return float(there[0]), float(there[1])
-
-
-def covariance_in_frame(covariance: FloatArray, frame: TrajectoryFrame) -> FloatArray:
-    """Covariances (..., 4, 4) of x, y, height and yaw in a frame of reference, given in the axes of the first image."""
-    change = np.eye(4)
-    change[:2, :2] = AXES[frame]
-    return np.asarray(change @ covariance @ change.T)
-
-
-def ros_covariance(covariance: FloatArray, frame: TrajectoryFrame) -> FloatArray:
-    """The same (..., 6, 6) of x, y, z and the turns about these axes, radians, as messages of ROS have it.
-
-    The tilt has been taken out of the poses: of the turns about x and y nothing is said.
-    """
-    known, place = covariance_in_frame(covariance, frame), np.array([0, 1, 2, 5])
-    sign = -_turn(frame)
-    whole = np.zeros((*covariance.shape[:-2], 6, 6))
-    whole[..., place[:, None], place] = known * np.outer([1.0, 1.0, sign, sign], [1.0, 1.0, sign, sign])
-    whole[..., 3, 3] = whole[..., 4, 4] = NOT_MEASURED
-    return whole
-
-
-def _turn(frame: TrajectoryFrame) -> float:
-    """Sign of z down, and so of a turn about z against the yaw, in a frame of reference."""
-    return float(np.linalg.det(AXES[frame]))
-
-
 def as_csv(path: Trajectory, frame: TrajectoryFrame) -> str:
     """A table with a header; what is not known of a frame is empty. Covariances, if known, are the last ten columns."""
     count = len(path)
@@ -155,12 +105,12 @@ def as_kitti(path: Trajectory, frame: TrajectoryFrame) -> str:
 
 def heading(path: Trajectory, frame: TrajectoryFrame) -> FloatArray:
     """Turn of the camera about z (F,), radians."""
-    return np.asarray(-_turn(frame) * path.yaw)
+    return np.asarray(-turn_about_z(frame) * path.yaw)
 
 
 def positions_in_frame(path: Trajectory, frame: TrajectoryFrame) -> FloatArray:
     """x, y and z of the camera, shape (F, 3)."""
-    return np.column_stack([path.position @ AXES[frame].T, -_turn(frame) * path.height]) + 0.0  # no minus zero
+    return np.column_stack([path.position @ AXES[frame].T, -turn_about_z(frame) * path.height]) + 0.0  # no minus zero
 
 
 def has_times(path: Trajectory) -> bool:

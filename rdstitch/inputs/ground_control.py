@@ -1,7 +1,7 @@
 """Ground control points, by OpenDroneMap's list or a table."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.inputs.positions import COLUMNS, UNITS, accuracy_of, geographic_places
 from rdstitch.inputs.rows_of_images import ImagesByName
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import Row, csv_rows, is_table, numbered_lines
+from rdstitch.inputs.tables import Row, csv_rows, is_table, numbered_lines, numbers_before, rows_of
 from rdstitch.system.file_access import read_text
 
 _ACCURACIES = {name: aliases for name, aliases in COLUMNS.items() if name.endswith("std")}
@@ -46,8 +46,7 @@ def with_ground_control(
     if file is None:
         return list(sources)
     system, body = NamedSystem.above(read_text(file))
-    rows: Iterable[Row]
-    if is_table(body, str(file), _CONTROL, UNITS):
+    if is_table(body, str(file), _CONTROL, _is_listed, UNITS):
         rows = csv_rows(body, str(file), _CONTROL, _CONTROL_WANTED, UNITS)
         epsg = WGS84 if any("latitude" in row.values for row in rows) else epsg
     else:
@@ -98,13 +97,19 @@ def _marks(rows: Iterable[Row], sources: Sequence[Source]) -> list[_Mark]:
     return marks
 
 
-def _opendronemap(text: str, file: str) -> Iterator[Row]:
+def _is_listed(line: str) -> bool:
+    return len(numbers_before(line.split(maxsplit=5)[:5])) == 5
+
+
+def _opendronemap(text: str, file: str) -> list[Row]:
     """The lines of a ``gcp_list.txt`` below its coordinate system; what follows the numbers is an image and a point."""
+    found = []
     for where, line in numbered_lines(text, file):
         fields = line.split(maxsplit=5)
         if len(fields) < 6:
             raise InputError(f"{where}: expected X Y Z PX PY IMAGE [NAME], or a heading like {_CONTROL_WANTED[0]}")
-        yield Row(where, dict(zip(_CONTROL_LISTED, fields, strict=True)), ".")
+        found.append((where, zip(_CONTROL_LISTED, fields, strict=True)))
+    return rows_of(found)
 
 
 def _images_and_point(row: Row, names: ImagesByName) -> tuple[list[int], str]:

@@ -22,10 +22,11 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.crs import WGS84, Crs
 from rdstitch.geometry.places import GpsPosition
+from rdstitch.inputs.image_folders import READABLE_SUFFIXES
 from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.inputs.rows_of_images import RowsByImage
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import NUMERAL, Row, csv_rows, is_table, json_rows, listed_rows
+from rdstitch.inputs.tables import NUMERAL, Row, csv_rows, is_table, json_rows, numbered_lines, numbers_before, rows_of
 from rdstitch.inputs.tracks import by_events, is_list_of_events, on_track, subtitle_points, track_points
 from rdstitch.system.file_access import read_text
 
@@ -46,7 +47,12 @@ _SIDES = (("latitude", "south"), ("longitude", "west"))
 _SIDE_WORDS = {"latitude": ("n", "north", "s", "south"), "longitude": ("e", "east", "w", "west")}
 _UNIT_WORDS = ["d", "deg", "degree", "degrees", "º", "m", "min", "minute", "minutes", "sec", "second", "seconds"]
 _LISTED = ("name", "x", "y", "altitude", "yaw", "pitch", "roll", "north_std", "up_std")  # in geo.txt
+_NUMBER_IN_WORD = re.compile(rf"(?:.*[,;])?{NUMERAL.pattern}")
 _WANTED = ("name,latitude,longitude", "name,x,y")
+# Words that follow an image's ending, or another one in the last folder.
+_BEHIND_A_NAME = re.compile(
+    rf"({'|'.join(map(re.escape, READABLE_SUFFIXES))}|\.[A-Za-z]\w+(?!.*[\\/]))\s(?!.*\.[A-Za-z]\w+$)", re.IGNORECASE
+)
 UNITS = ("deg", "degrees", "m", "metres", "meters")
 _RECORDS = "a list of objects with SourceFile, GPSLatitude and GPSLongitude"
 
@@ -108,15 +114,37 @@ def _places(sources: Sequence[Source], file: str | Path, epsg: int | None, offse
         named, below = NamedSystem.above(text)
         if text.lstrip().startswith(("[", "{")):
             rows = json_rows(text, name, COLUMNS, _RECORDS)
-        elif named is None or is_table(below, name, COLUMNS, UNITS):
+        elif named is None or is_table(below, name, COLUMNS, _listed_fields, UNITS):
             rows, system = csv_rows(below, name, COLUMNS, _WANTED, UNITS), named or system
         else:
-            rows, system = listed_rows(below, name, _LISTED), named
+            rows, system = _listed(below, name), named
         named_rows = RowsByImage(row for row in rows if _coordinates(row) is not None)
         places = _by_rows(named_rows.of(sources), name, system)
         if not any(places):
             raise InputError(f"{file}: has no position of {sources[0].name}, nor of any other of the images")
     return places
+
+
+def _listed(text: str, file: str) -> list[Row]:
+    """The lines of a ``geo.txt`` below its coordinate system."""
+    found = []
+    for where, line in numbered_lines(text, file):
+        if not (fields := _listed_fields(line)):
+            raise InputError(f"{where}: expected a name and numbers between blanks, not '{line}'")
+        found.append((where, zip(_LISTED, fields, strict=False)))
+    return rows_of(found)
+
+
+def _listed_fields(line: str) -> list[str]:
+    """A name, which may hold blanks, and two numbers or more, which other words may follow; empty for other lines."""
+    fields, most = line.split(), len(_LISTED) - 1
+    for end in range(1, len(fields)):
+        rest = fields[end : end + most]
+        numbers = numbers_before(rest)
+        if len(numbers) > 1 and not any(map(_NUMBER_IN_WORD.match, rest[len(numbers) :])):
+            name = line.rsplit(maxsplit=len(fields) - end)[0]
+            return [] if _BEHIND_A_NAME.search(name) else [name, *numbers]
+    return []
 
 
 def _by_rows(rows: Sequence[Row | None], file: str, system: NamedSystem | None) -> list[GpsPosition | None]:

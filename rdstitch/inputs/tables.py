@@ -41,7 +41,6 @@ _NOTATIONS = {
     for mark, other in (".,", ",.")
 }
 _GROUPED = re.compile(r"(?<=\d)[\s'’](?=\d{3}(?!\d))")
-_BEHIND_A_NAME = re.compile(r"\.[A-Za-z]\w+\s(?!.*(\.[A-Za-z]\w+$|[\\/]))")  # words that follow a file's ending
 NUMERAL = re.compile(r"[-+\u2212]?[.,]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+)?")
 
 
@@ -133,15 +132,21 @@ def csv_rows(
                 rows.append((where, zip(meanings, fields, strict=False)))
     except csv.Error as error:
         raise InputError(f"{file}: line {reader.line_num + start}: is not CSV: {error}") from error
-    return _rows(rows)
+    return rows_of(rows)
 
 
-def is_table(text: str, file: str, columns: Mapping[str, str], units: Sequence[str] = ()) -> bool:
-    """Whether it is what :func:`csv_rows` reads, not a list, above which a comment may name columns too."""
+def is_table(
+    text: str, file: str, columns: Mapping[str, str], is_listed: Callable[[str], object], units: Sequence[str]
+) -> bool:
+    """Whether it is what :func:`csv_rows` reads, not a list, above which a comment may name columns too.
+
+    ``is_listed`` tells a line of the list, which may hold decimal commas.
+    """
     known = _finder(file, columns, units)
     heading = next((line for line in text.splitlines() if _is_heading(line, known)), "")
     first = next((line for _, line in numbered_lines(text, file)), "")
-    return _names_columns(heading, known) and _delimiter(heading) in first
+    delimiter = _delimiter(heading)
+    return _names_columns(heading, known) and delimiter in first and (delimiter == "\t" or not is_listed(first))
 
 
 def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> list[Row]:
@@ -150,7 +155,7 @@ def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> 
     if not isinstance(content, list) or not all(isinstance(item, dict) for item in content):
         raise InputError(f"{file}: expected {wanted}")
     known = _finder(file, columns, ())
-    return _rows(
+    return rows_of(
         (f"{file}: [{number}]", ((known(key), value) for key, value in item.items()))
         for number, item in enumerate(content)
     )
@@ -162,27 +167,12 @@ def numbered_lines(text: str, file: str) -> list[tuple[str, str]]:
     return [(where, line) for where, line in lines if line and not line.startswith("#")]
 
 
-def listed_rows(text: str, file: str, columns: Sequence[str]) -> list[Row]:
-    """Lines of a name, which may hold blanks, two numbers or more, and other words; see :func:`numbered_lines`."""
-    rows = []
-    for where, line in numbered_lines(text, file):
-        fields = line.split()
-        found = ((end, _numbers_before_words(fields[end : end + len(columns) - 1])) for end in range(1, len(fields)))
-        end, numbers = next(((end, numbers) for end, numbers in found if numbers), (1, []))
-        name = line.rsplit(maxsplit=len(fields) - end)[0]
-        if not numbers or _BEHIND_A_NAME.search(name):
-            raise InputError(f"{where}: expected a name and numbers between blanks, not '{line}'")
-        rows.append((where, zip(columns, (name, *numbers), strict=False)))
-    return _rows(rows)
+def numbers_before(fields: Sequence[str]) -> list[str]:
+    """Those of the fields before the first that is no number, nor an empty one."""
+    return list(takewhile(lambda field: _readings(field) or field.lower() in _EMPTY, fields))
 
 
-def _numbers_before_words(fields: Sequence[str]) -> list[str]:
-    """The numbers that the fields begin with, where they are two or more and no word behind them begins like one."""
-    numbers = list(takewhile(lambda field: _readings(field) or field.lower() in _EMPTY, fields))
-    return [] if len(numbers) < 2 or any(map(NUMERAL.match, fields[len(numbers) :])) else numbers
-
-
-def _rows(found: Iterable[tuple[str, Iterable[tuple[str | None, Any]]]]) -> list[Row]:
+def rows_of(found: Iterable[tuple[str, Iterable[tuple[str | None, Any]]]]) -> list[Row]:
     """Rows with the decimal mark that their unambiguous numbers share."""
     rows = []
     for where, pairs in found:

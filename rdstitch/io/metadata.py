@@ -65,6 +65,7 @@ class Metadata:
     # EXIF orientation (1 to 8) stored in the file; readers of this project have applied it already
     orientation: int = 1
     focal_px: float | None = None  # focal length, pixels, where the file tells it
+    focal_mm: float | None = None  # the same, millimetres, which crops and resizing leave as it is
     gps: GpsPosition | None = None
     gps_problem: str = ""  # why the position in the file is not used; empty where it is, or where there is none
     attitude: Attitude | None = None
@@ -182,6 +183,7 @@ def _metadata(
         bit_depth=bit_depth,
         orientation=orientation,
         focal_px=focal_length(photo, xmp, size),
+        focal_mm=finite(photo.get(ExifTags.Base.FocalLength)) or None,
         gps=gps,
         gps_problem=gps_problem,
         attitude=read_attitude(xmp),

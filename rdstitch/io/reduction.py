@@ -30,7 +30,7 @@ def block_mean(samples: NDArray[Any], factor: int) -> NDArray[Any]:
 
 
 def mean_of_channels(samples: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Mean over the channels, up to four, of samples (h, w) or (h, w, C); fifty times faster than NumPy."""
+    """Mean over the channels, up to 128, of samples (h, w) or (h, w, C); faster than NumPy, for three fifty times."""
     if samples.ndim == 2:
         return samples
     channels = samples.shape[2]

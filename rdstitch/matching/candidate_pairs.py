@@ -7,7 +7,7 @@ loop.
 """
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 from itertools import combinations, islice
 
@@ -136,11 +136,17 @@ def estimate_candidates(estimator: PairEstimator, candidates: Sequence[Pair]) ->
 
 
 def loop_closures(
-    cameras: Sequence[Camera], homographies: FloatArray, tried: set[Pair], *, on_sphere: bool = False
+    cameras: Sequence[Camera],
+    homographies: FloatArray,
+    registered: set[Pair],
+    failed: Set[Pair] = frozenset(),
+    *,
+    on_sphere: bool = False,
 ) -> list[Pair]:
     """Pairs that the poses put over one another and that were not tried yet, where the match graph needs them.
 
-    It does not need a pair of images that both have their partners, one of them in common: that closes no loop.
+    It does not need a pair of images that both have their partners, one of them in common: that closes no loop. Only
+    pairs that were ``registered`` make partners, not those that ``failed``.
     ``homographies`` (N, 3, 3) lead from undistorted normalized coordinates to the plane, or to directions
     (``on_sphere``); NaN for images without a pose.
     """
@@ -153,14 +159,15 @@ def loop_closures(
     size = np.linalg.norm(middles[known], axis=1) if on_sphere else middles[known, 2]
     centres = middles[known] / size[:, None]
     partners = defaultdict[int, set[int]](set)
-    for i, j in tried:
+    for i, j in registered:
         partners[i].add(j)
         partners[j].add(i)
 
     def needed(i: int, j: int) -> bool:
         return min(len(partners[i]), len(partners[j])) < _PARTNERS or not partners[i] & partners[j]
 
-    pairs = [pair for pair in sorted(_nearest_pairs(centres, known, _NEIGHBOURS) - tried) if needed(*pair)]
+    untried = _nearest_pairs(centres, known, _NEIGHBOURS) - registered - failed
+    pairs = [pair for pair in sorted(untried) if needed(*pair)]
     both = np.array([*pairs, *(pair[::-1] for pair in pairs)], dtype=np.intp).reshape(-1, 2)
     seen = _shares_seen(cameras, homographies, both)
     return [pair for pair, most in zip(pairs, seen.reshape(2, -1).max(axis=0), strict=True) if most >= _MIN_OVERLAP]

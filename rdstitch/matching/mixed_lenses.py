@@ -76,12 +76,14 @@ def separate_lenses(
     None where one lens will do or λ is known (``known_distortion``); none are left out where it is not clear which
     belong together. ``threshold``: largest transfer error of an inlier, pixels.
     """
-    mixed = None if known_distortion is not None else two_lenses(cameras, LensVotes.of(pairs, threshold))
-    if mixed is None or not mixed.certain:
+    votes = None if known_distortion is not None else LensVotes.of(pairs, threshold)
+    mixed = None if votes is None else two_lenses(cameras, votes)
+    if votes is None or mixed is None or not mixed.certain:
         return mixed, {}
-    sizes = []
+    voted, sizes = np.union1d(votes.image1, votes.image2).tolist(), []
     for second in (False, True):
-        of_lens = [p for p in pairs if p.relation and mixed.second[[*p.images]].tolist() == [second] * 2]
+        images = {k for k in voted if mixed.second[k] == second}
+        of_lens = [p for p in pairs if p.relation and images.issuperset(p.images)]
         members = {image for pair in of_lens for image in pair.images}
         sizes.append((len(members), sum(int(pair.relation.inliers.sum()) for pair in of_lens)))
     kept = sizes[1] > sizes[0]
@@ -89,7 +91,7 @@ def separate_lenses(
         f"comes from another lens or zoom setting (λ about {mixed.distortion[not kept]:.3f}, that of the others "
         f"{mixed.distortion[kept]:.3f}); stitch those of each on their own"
     )
-    return mixed, {int(k): reason for k in np.flatnonzero(mixed.second != kept)}
+    return mixed, {k: reason for k in voted if mixed.second[k] != kept}
 
 
 def _divisions(count: int, votes: LensVotes) -> Iterator[tuple[BoolArray, FloatArray]]:

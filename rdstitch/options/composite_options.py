@@ -87,7 +87,11 @@ class CompositeOptions(UprightOptions):
         pixels=True,
     )
     like: str | Path | None = option(
-        None, "Grid of the output: coordinate system, pixels and extent of this GeoTIFF file.", "FILE", pixels=True
+        None,
+        "Grid of the output: coordinate system, pixels and extent of this GeoTIFF file.",
+        "FILE",
+        reads=True,
+        pixels=True,
     )
     extent: tuple[float, float, float, float] | None = option(
         None,

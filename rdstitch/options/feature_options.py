@@ -48,7 +48,7 @@ class FeatureOptions(Options):
         "Equalize local contrast before detection; None: of a set whose images show too little otherwise.",
         command_line=False,
     )
-    aliked_model: str | Path | None = option(None, "ONNX file of the network of --features aliked.", "FILE")
+    aliked_model: str | Path | None = option(None, "ONNX file of the network of --features aliked.", "FILE", reads=True)
     aliked_size: int = option(
         640, "Side of the square image that the network takes, pixels.", least=1, command_line=False
     )

@@ -37,14 +37,10 @@ class Option:
     none: str = ""  # the word for None on the command line
     default: str = ""  # what help pages say of the default, where its value says too little
     entered: Any = None  # the type on the command line, where that of the field is another one
-    writes: bool = False  # whether it names a file or folder that is written
+    reads: bool = False  # whether it names a file or folder that is read
+    writes: bool = False  # the same of one that is written
     command_line: bool = True
     pixels: bool = False  # whether it says which pixels the output has
-
-    def names_read(self, value: Any) -> bool:
-        """Whether a value names a file or folder that is read."""
-        words = [word for word in self.metavar.split("|") if word.islower()]
-        return "FILE" in self.metavar and not self.writes and isinstance(value, str | PathLike) and value not in words
 
     def allows(self, number: float) -> bool:
         """Check a number by the limits."""
@@ -84,6 +80,10 @@ class Declared:
         """What it may be, in words."""
         words = [f"one of {', '.join(self.words)}"] if len(self.words) > 2 else list(self.words)
         return " or ".join([*words, *(_in_words(kind, self.option) for kind in self.types)])
+
+    def names_read(self, value: Any) -> bool:
+        """Whether a value names a file or folder that is read."""
+        return self.option.reads and isinstance(value, str | PathLike) and value not in self.words
 
     def fits(self, value: Any) -> bool:
         """Check a value; of texts and files only that they are none of another type."""
@@ -153,7 +153,7 @@ class Options:
     def files(self) -> list[Path]:
         """The files that are read besides the images, none of which may be written over."""
         values = {each.name: getattr(self, each.name) for each in fields(self)}
-        named = [values[name] for name, each in declared(self).items() if each.option.names_read(values[name])]
+        named = [values[name] for name, each in declared(self).items() if each.names_read(values[name])]
         within = [options.files for options in values.values() if isinstance(options, Options)]
         return [*files_in(*named), *chain(*within)]
 

@@ -25,14 +25,15 @@ Mask = Annotated[
     Option(
         "Mask whose black pixels are excluded: a folder of masks with the images' names, or one file for all.",
         "DIR|FILE",
+        reads=True,
     ),
 ]
 FlatField = Annotated[
-    str | Path,
+    Literal["auto", "off"] | str | Path,
     Option(
         "Flat-field correction: estimated from the images, or read from FILE (second page: the dark field).",
         "auto|off|FILE",
-        entered=Literal["auto", "off"] | Path,
+        reads=True,
     ),
 ]
 Workers = Annotated[

@@ -55,7 +55,9 @@ class StitchOptions(RansacOptions):
         above=0.0,
         command_line=False,
     )
-    lightglue_model: str | Path | None = option(None, "LightGlue network (ONNX) for these features.", "FILE")
+    lightglue_model: str | Path | None = option(
+        None, "LightGlue network (ONNX) for these features.", "FILE", reads=True
+    )
     lens: LensName = option(
         "auto", "Lens to estimate: λ; λ and the distortion centre; besides them a second or a third coefficient."
     )
@@ -65,6 +67,7 @@ class StitchOptions(RansacOptions):
         "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap, Hugin or lensfun; its lens is not "
         "estimated.",
         "FILE",
+        reads=True,
         entered=Path | None,
     )
     distortion: Distortion = None
@@ -73,7 +76,10 @@ class StitchOptions(RansacOptions):
         None, "Known tilt of the camera, degrees.", "PSI,THETA", above=-math.pi / 2, below=math.pi / 2, unit="radians"
     )
     attitude: Literal["xmp"] | str | Path | None = option(
-        None, "Tilt of each image: CSV name,psi,theta in degrees; xmp: from the XMP of drone images.", "FILE|xmp"
+        None,
+        "Tilt of each image: CSV name,psi,theta in degrees; xmp: from the XMP of drone images.",
+        "FILE|xmp",
+        reads=True,
     )
     attitude_std: float = option(
         math.radians(1.0),
@@ -88,12 +94,14 @@ class StitchOptions(RansacOptions):
         "Time stamps of the images: CSV name,timestamp, lines TIME NAME, or a time a line; otherwise those of the "
         "video, bag or EXIF.",
         "FILE",
+        reads=True,
     )
     odometry: "Odometry | str | Path | None" = option(
         None,
         "Wheel odometry, by time: TUM's lines, CSV timestamp,x,y,yaw_deg, or a topic of the bag. It gives the unit of "
         "positions, and poses of frames without texture.",
         "FILE|TOPIC",
+        reads=True,
         entered=str | None,
     )
     positions: str | Path | None = option(
@@ -101,6 +109,7 @@ class StitchOptions(RansacOptions):
         "Where images were taken, instead of EXIF: CSV name,lat,lon or name,x,y (see --crs), exiftool's -csv or "
         "-json, OpenDroneMap's geo.txt, or a GPX track.",
         "FILE",
+        reads=True,
     )
     positions_offset: float = option(0.0, "Seconds from the times of the images to those of the GPX track (UTC).", "S")
     position_accuracy: float | None = option(
@@ -111,9 +120,10 @@ class StitchOptions(RansacOptions):
         "Ground control points, as OpenDroneMap's gcp_list.txt, or CSV x,y,px,py,image,name,accuracy (see --crs); "
         "they bend the alignment, and place the output on the Earth.",
         "FILE",
+        reads=True,
     )
     check_points: str | Path | None = option(
-        None, "Points like those of --gcp that are compared with the map, and take no part in it.", "FILE"
+        None, "Points like those of --gcp that are compared with the map, and take no part in it.", "FILE", reads=True
     )
     mask: Mask = None
     channel_order: ArrayChannels = "bgr"

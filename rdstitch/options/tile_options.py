@@ -39,6 +39,7 @@ class TileOptions(Options):
         "CSV with name,x,y (pixels) or name,x_um,y_um, or Fiji's TileConfiguration.txt; otherwise what OME-TIFF "
         "or Micro-Manager say.",
         "FILE",
+        reads=True,
         entered=Path | None,
     )
     grid: str | None = option(

@@ -279,8 +279,10 @@ def draft_with_loops(
     aligned = aligner.draft(pairs)
     for _ in range(_ROUNDS):
         pairs, alignment = aligned.pairs, aligned.alignment
-        tried = {pair.images for pair in pairs}
-        neighbours = loop_closures(alignment.cameras, alignment.homographies, tried, on_sphere=alignment.on_sphere)
+        tried, registered = {pair.images for pair in pairs}, {pair.images for pair in pairs if pair.relation}
+        neighbours = loop_closures(
+            alignment.cameras, alignment.homographies, registered, tried - registered, on_sphere=alignment.on_sphere
+        )
         unaligned = {(i, j) for i, j in candidates if not (alignment.used[i] and alignment.used[j])} - tried
         more = estimator.estimate(sorted(unaligned.union(neighbours)), distortion=alignment.distortion)
         selected = select_by_whole_lens(aligned, aligner.threshold)

@@ -23,7 +23,7 @@ from rdstitch.compositing import (
 )
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.tiles import BlockRunner
-from rdstitch.export.georeference import Georeference, world_file_paths
+from rdstitch.georeferencing.georeference import Georeference, world_file_paths
 from rdstitch.inputs.source import Source
 from rdstitch.io.formats import check_memory, check_size
 from rdstitch.io.metadata import Metadata

@@ -25,6 +25,7 @@ from rdstitch.results.registration import Registration
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.progress import Progress, silent
 from rdstitch.verification.limits import Limits
+from rdstitch.verification.rules import focal_ratio
 from rdstitch.verification.verdict import RefusedError
 
 _MEGAPIXELS, _FEATURES = 0.2, 500  # of the small versions
@@ -272,10 +273,9 @@ def _camera(source: Source) -> str:
 
 def _focal(sources: Sequence[Source]) -> tuple[str, bool]:
     """Give what is known of the focal length, and whether the lens was zoomed."""
-    pixels = [(s.metadata.focal_px, max(s.metadata.size)) for s in sources if s.metadata.focal_px is not None]
+    zoomed = focal_ratio(source.metadata for source in sources)[0] > Limits.max_focal_ratio
+    pixels = [source.metadata.focal_px for source in sources if source.metadata.focal_px is not None]
     if not pixels:
-        return "not known from EXIF; it is guessed, which matters for trajectory only", False
-    shares = [focal / side for focal, side in pixels]
-    zoomed = max(shares) > Limits.max_focal_ratio * min(shares)
-    text = f"{min(pixels)[0]:.0f}" + (f" to {max(pixels)[0]:.0f}" if zoomed else "")
+        return "not known from EXIF; it is guessed, which matters for trajectory only", zoomed
+    text = f"{min(pixels):.0f}" + (f" to {max(pixels):.0f}" if zoomed else "")
     return f"{text} pixels by EXIF in {len(pixels)} of {len(sources)} images", zoomed

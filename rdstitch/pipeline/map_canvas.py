@@ -9,10 +9,10 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
 from rdstitch.errors import ArgumentError
-from rdstitch.export.georeference import Georeference
-from rdstitch.export.map_grid import MapGrid, grid_of_extent, read_grid
-from rdstitch.export.place_on_map import MIN_POSITIONS, has_place, place_on_map
 from rdstitch.geometry.crs import Crs
+from rdstitch.georeferencing.georeference import Georeference
+from rdstitch.georeferencing.map_grid import MapGrid, grid_of_extent, read_grid
+from rdstitch.georeferencing.place_on_map import MIN_POSITIONS, has_place, place_on_map
 from rdstitch.inputs.source import Source
 from rdstitch.results.placed_images import PlacedImages
 

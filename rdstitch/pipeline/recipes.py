@@ -244,7 +244,7 @@ def trajectory(
     height : float, optional
         Height of the first frame above the plane, metres; positions are in metres then, and in heights without it.
     frame : str, optional
-        "enu", "ros" or "camera": the axes of the file, see :mod:`rdstitch.export.trajectory_files`. "enu" if not given,
+        "enu", "ros" or "camera": the axes of the file, see :mod:`rdstitch.geometry.path_frames`. "enu" if not given,
         but for "kitti", whose axes are the camera's, and for "bag", whose axes are those of ROS.
 
     Returns

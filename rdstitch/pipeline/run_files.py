@@ -11,12 +11,12 @@ import numpy as np
 from rdstitch.alignment.result import links_by_image
 from rdstitch.choices import TrajectoryFormat
 from rdstitch.compositing import Canvas
-from rdstitch.export.georeference import world_file_paths
 from rdstitch.export.layers import layer_files, stage_layers
 from rdstitch.export.map_server import check_map_server, map_files, write_map
-from rdstitch.export.place_on_map import has_place
 from rdstitch.export.poses_files import poses_file
 from rdstitch.export.write_trajectory import check_bag
+from rdstitch.georeferencing.georeference import world_file_paths
+from rdstitch.georeferencing.place_on_map import has_place
 from rdstitch.inputs.source import Source
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message

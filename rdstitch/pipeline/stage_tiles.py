@@ -264,7 +264,7 @@ def _plane(sources: Sequence[Source], channel: int | None, index: int) -> NDArra
     if pixels.ndim == 2:
         return pixels
     if channel is None:
-        return mean_of_channels(pixels.astype(np.float32)) if count <= 4 else pixels.mean(axis=2)
+        return mean_of_channels(pixels.astype(np.float32))
     return np.ascontiguousarray(pixels[..., channel])
 
 

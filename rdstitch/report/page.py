@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rdstitch.export.georeference import map_summary
+from rdstitch.georeferencing.georeference import map_summary
 from rdstitch.report.lens import lens_curve, votes
 from rdstitch.report.mosaic import mosaic_section
 from rdstitch.report.pairs import match_graph, matched, residual_map

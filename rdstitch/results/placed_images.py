@@ -14,10 +14,10 @@ from rdstitch.compositing import Canvas
 from rdstitch.compositing.source_images import Displacement, PlacedImage
 from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
 from rdstitch.compositing.visible_region import VisibleRegion
-from rdstitch.export.georeference import Georeference
-from rdstitch.export.place_on_map import Located, has_place
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.places import GpsPosition
+from rdstitch.georeferencing.georeference import Georeference
+from rdstitch.georeferencing.place_on_map import Located, has_place
 from rdstitch.inputs.source import Source
 from rdstitch.io.radiometric_tags import Radiometry
 from rdstitch.io.read import DecodedImage

@@ -8,7 +8,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import TrajectoryFrame
-from rdstitch.export.trajectory_files import covariance_in_frame, in_frame, ros_covariance
+from rdstitch.geometry.path_frames import covariance_in_frame, in_frame, ros_covariance
 from rdstitch.results.messages import Message
 from rdstitch.tracking import TrackingResult
 
@@ -22,7 +22,7 @@ class FollowedPoses:
     height : float, optional
         Of the first keyframe above the plane, in the unit that positions shall have; else as odometry says, or 1.
     frame : str
-        "enu", "ros" or "camera", see :mod:`rdstitch.export.trajectory_files`.
+        "enu", "ros" or "camera", see :mod:`rdstitch.geometry.path_frames`.
     """
 
     height: float | None = None
@@ -100,7 +100,7 @@ class Pose:
 
     @property
     def ros_covariance(self) -> FloatArray | None:
-        """The same as messages of ROS have it, (6, 6); see :func:`rdstitch.export.trajectory_files.ros_covariance`."""
+        """The same as messages of ROS have it, (6, 6); see :func:`rdstitch.geometry.path_frames.ros_covariance`."""
         known = self._covariance
         return None if known is None else ros_covariance(known, self.poses.frame)
 

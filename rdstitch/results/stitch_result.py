@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing import Canvas, Composite, CompositePlan, FileComposite, SeamQuality
 from rdstitch.errors import ArgumentError
-from rdstitch.export.georeference import Georeference
+from rdstitch.georeferencing.georeference import Georeference
 from rdstitch.inputs.frame import to_channel_order
 from rdstitch.io.preview import encode_preview, read_preview
 from rdstitch.io.read import read_image

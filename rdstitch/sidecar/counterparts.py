@@ -3,7 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from functools import cache
+from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
 
@@ -39,13 +39,14 @@ def counterparts(
     # Arrays have no names of their own.
     if match == "order" or all(frame.image is not None for frame in frames):
         return list(_by_order(saved, frames)), "order", []
-    headers = cache(_known_of_frame)  # each is read once
+    if match == "auto":  # read once, for whoever takes the frame
+        frames = [_with_header(frame) for frame in frames]
     ways: tuple[tuple[MatchedBy, Callable[[], Chosen | None]], ...] = (
         ("name", lambda: _by_name(saved, frames, attrgetter("name"))),
         ("name", lambda: _by_name(saved, frames, attrgetter("stem"))),
         ("name", lambda: _by_varying_part(saved, frames)),
-        ("time", lambda: _by_measurement(saved, frames, _seconds, headers)),
-        ("position", lambda: _by_measurement(saved, frames, _metres, headers)),
+        ("time", lambda: _by_measurement(saved, frames, _seconds)),
+        ("position", lambda: _by_measurement(saved, frames, _metres)),
     )
     for matched, find in ways[:3] if match == "name" else ways:
         found = find() or [None] * len(saved.images)
@@ -53,7 +54,7 @@ def counterparts(
         chosen = [None if image.to_plane is None else frame for image, frame in pairs]
         if any(frame is not None for frame in chosen):
             if matched == "name" and match == "auto":
-                _refuse_other_flights(saved, chosen, headers)
+                _refuse_other_flights(saved, chosen)
             return chosen, matched, _without_counterpart(found, frames)
     for path in files_of(frames):
         check_readable(path)
@@ -92,10 +93,10 @@ def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[P
     return chosen
 
 
-def _refuse_other_flights(saved: SavedRegistration, chosen: Chosen, headers: Callable[[Frame], _Known]) -> None:
+def _refuse_other_flights(saved: SavedRegistration, chosen: Chosen) -> None:
     """Refuse equal names of another flight, as cameras begin again at 1: times, or else places, tell them apart."""
     frames = [frame for frame in chosen if frame is not None]
-    near = next(filter(None, (_by_measurement(saved, frames, by, headers) for by in (_seconds, _metres))), chosen)
+    near = next(filter(None, (_by_measurement(saved, frames, by) for by in (_seconds, _metres))), chosen)
     for image, by_name, by_place in zip(saved.images, chosen, near, strict=True):
         if by_name is not None and by_place is not None and by_name is not by_place:
             raise InputError(
@@ -142,12 +143,11 @@ def _by_measurement(
     saved: SavedRegistration,
     frames: Sequence[Frame],
     measure: Callable[[Sequence[_Known], Sequence[_Known]], tuple[FloatArray, FloatArray]],
-    headers: Callable[[Frame], _Known],
 ) -> Chosen | None:
     """By what is nearer than half the way to the next registered image; None where most have no such counterpart."""
     if any(frame.image is not None or frame.number is not None for frame in frames):
         return None
-    here, there = measure([_known_of(image) for image in saved.images], [*map(headers, frames)])
+    here, there = measure(list(map(_known_of, saved.images)), list(map(_known_of_frame, frames)))
     used = np.array([image.to_plane is not None for image in saved.images])
     here = np.where(used[:, None], here, np.nan)
     known, given = (np.flatnonzero(np.isfinite(one).all(axis=1)) for one in (here, there))
@@ -168,12 +168,17 @@ def _known_of(image: ImageRecord) -> _Known:
 
 
 def _known_of_frame(frame: Frame) -> _Known:
-    """By its header; of one that cannot be read, which is left out by name when its pixels are, nothing."""
+    return (None, None) if frame.metadata is None else (frame.metadata.timestamp, frame.metadata.gps)
+
+
+def _with_header(frame: Frame) -> Frame:
+    """The frame with what its file's header says; of one that cannot be read who reads its pixels will say so."""
+    if frame.image is not None or frame.number is not None or frame.metadata is not None:
+        return frame
     try:
-        metadata = read_metadata(frame.path)
+        return replace(frame, metadata=read_metadata(frame.path))
     except InputError:
-        return None, None
-    return metadata.timestamp, metadata.gps
+        return frame
 
 
 def _by_order(saved: SavedRegistration, frames: Sequence[Frame]) -> Sequence[Frame]:

@@ -13,7 +13,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, SeamQuality
 from rdstitch.compositing.panorama_canvas import center_of_view, field_of_view
 from rdstitch.compositing.projection import PLANE
-from rdstitch.export.georeference import Georeference, Residual
+from rdstitch.georeferencing.georeference import Georeference, Residual
 from rdstitch.inputs.source import Source
 from rdstitch.local_alignment import DisplacementField
 from rdstitch.results.stitch_result import OutputImage

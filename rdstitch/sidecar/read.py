@@ -13,8 +13,8 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.export.georeference import Georeference, Residual
 from rdstitch.geometry.crs import Crs
+from rdstitch.georeferencing.georeference import Georeference, Residual
 from rdstitch.sidecar.records import VERSION, ImageRecord, OutputRecord, ResidualRecord, SidecarRecord
 from rdstitch.system.file_access import read_text
 from rdstitch.system.output_checks import tiles_folder

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from rdstitch.compositing import Canvas, CompositeOptions, SeamQuality
 from rdstitch.compositing.projection import PLANE
-from rdstitch.export.georeference import Georeference, check_summary, map_summary
+from rdstitch.georeferencing.georeference import Georeference, check_summary, map_summary
 from rdstitch.inputs.source import Source
 from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE

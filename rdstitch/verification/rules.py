@@ -11,6 +11,7 @@ from typing import NamedTuple
 from rdstitch.alignment.result import LinkFit, Unused, links_by_image
 from rdstitch.alignment.sentences import few_features
 from rdstitch.choices import Purpose
+from rdstitch.io.metadata import Metadata
 from rdstitch.results.messages import Severity
 from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Kind
@@ -182,18 +183,33 @@ def _inputs(evidence: ResultEvidence) -> Iterator[Finding]:
     sources = evidence.registration.sources
     headers = [(k, source.metadata) for k, source in enumerate(sources)]
     bodies: dict[str, list[int]] = {}
+    numbered = {(header.make, header.model) for _, header in headers if header.serial}
     for k, header in headers:
-        if header.model or header.serial:
+        # A program that edits an image often leaves its serial number out: one without may be any of its model.
+        if header.serial or (header.model and (header.make, header.model) not in numbered):
             bodies.setdefault(" ".join(filter(None, (header.make, header.model, header.serial))), []).append(k)
-    focal = {k: header.focal_px / max(header.size) for k, header in headers if header.focal_px is not None}
+    ratio, near, far = focal_ratio(header for _, header in headers)
     if len(bodies) > 1:
         yield Finding(Kind.SEVERAL_CAMERAS, (), "warning", {"bodies": bodies})
-    elif focal and max(focal.values()) > Limits.max_focal_ratio * min(focal.values()):
-        near, far = min(focal, key=lambda k: focal[k]), max(focal, key=lambda k: focal[k])
-        yield Finding(Kind.ZOOMED, (), "warning", {"ratio": focal[far] / focal[near], "near": near, "far": far})
+    elif ratio > Limits.max_focal_ratio:
+        yield Finding(Kind.ZOOMED, (), "warning", {"ratio": ratio, "near": near, "far": far})
     without = [k for k, source in enumerate(sources) if source.mask is None]
     if 0 < len(without) < len(sources):
         yield Finding(Kind.UNMASKED, (), "warning", {"without": without})
+
+
+def focal_ratio(headers: Iterable[Metadata]) -> tuple[float, int, int]:
+    """The largest ratio of two focal lengths by headers, and the images with the shorter and the longer one.
+
+    Of millimetres, or of pixels of images of one size: a crop is no zoom.
+    """
+    groups: dict[object, dict[int, float]] = {}
+    for k, header in enumerate(headers):
+        for group, focal in (("mm", header.focal_mm), (tuple(sorted(header.size)), header.focal_px)):
+            if focal is not None:
+                groups.setdefault(group, {})[k] = focal
+    ends = [(min(each, key=each.__getitem__), max(each, key=each.__getitem__), each) for each in groups.values()]
+    return max(((focal[far] / focal[near], near, far) for near, far, focal in ends), default=(1.0, 0, 0))
 
 
 class Rule(NamedTuple):

@@ -179,7 +179,7 @@ def test_an_image_of_the_folder_is_never_replaced(rdstitch: Run, located: Path, 
         ("rdstitch.report.page.report_page", "report.html"),
         ("rdstitch.pipeline.run_files.viewer_page", "field.html"),
         ("rdstitch.camera_files.camera_file_text", "camera.json"),
-        ("rdstitch.export.georeference.Georeference.world_file_texts", "field.jgw"),
+        ("rdstitch.georeferencing.georeference.Georeference.world_file_texts", "field.jgw"),
     ],
 )
 def test_what_belongs_beside_an_image_never_costs_the_image(

@@ -80,6 +80,7 @@ def _read(folder: Path, text: str, epsg: int | None = None, offset: float = 0.0)
         "EPSG:4326\na.jpg -2.2945 48.8582222222 35.5 0 0 0\n\nb.jpg 2.2945 -48.8582222222\n",
         "EPSG:4326\n# name,x,y,z\na.jpg,-2.2945,48.8582222222,35.5\nb.jpg,2.2945,-48.8582222222\n",
         "EPSG:4326\n# name, x, y\na.jpg -2.2945 48.8582222222 35.5\nb.jpg 2.2945 -48.8582222222\n",
+        "EPSG:4326\n# name, x, y\na.jpg -2,2945 48,8582222222 35,5\nb.jpg 2,2945 -48,8582222222\n",
         "\n# of flight 3\nEPSG:4326\na.jpg -2.2945 48.8582222222 35.5\nb.jpg 2.2945 -48.8582222222\n",
     ],
 )
@@ -171,6 +172,7 @@ def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> N
         ("name,lat,lon\na.jpg,1,2\nb.jpg,oops,2\n", "line 3: expected a number for latitude, not 'oops'"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg oops 5e6\n", "line 3: expected a name and numbers between blanks, not 'b"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 500000m 5e6 100 0\n", "line 3: expected a name and numbers between blanks"),
+        ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg x y w/o 5 6\n", "line 3: expected a name and numbers between blanks"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 5e5 oops 100\n", "line 3: expected a name and numbers between blanks"),
         ("EPSG:32633\na.jpg 5e5 5e6\nb.jpg 5e5 5e6 1OO 0\n", "line 3: expected a name and numbers between blanks"),
         ("EPSG:32633\na.jpg 5e5 5e6 9 0 0 0 .02m .04\n", "line 2: expected a name and numbers between blanks"),
@@ -209,6 +211,7 @@ def test_control_points(tmp_path: Path) -> None:
     "lines",
     [
         "# x, y, z, px, py, image\n500000 5300000 5 30 20 a.jpg",
+        "# x, y, z, px, py, image\n500000 5300000 5 30,0 20 a.jpg\n500010,5 5300000 5 1,125 20 elsewhere, b.jpg",
         "500000\t5300000\t5\t30\t20\ta.jpg",
         "# x;y;px;py;image\n500000;5300000;30;20;a.jpg",
     ],
@@ -304,6 +307,36 @@ def test_control_points_as_a_table_with_accuracies(tmp_path: Path) -> None:
     assert with_ground_control(_sources(), tmp_path / "plain.csv", 32734)[0].control == one
     with pytest.raises(InputError, match="--crs"):
         with_ground_control(_sources(), tmp_path / "plain.csv")
+
+
+def test_names_in_lists_hold_blanks_and_words_follow_the_numbers(tmp_path: Path) -> None:
+    lines = [
+        "DJI 0001 (2).jpg 12.5 48 -3",
+        "# no\n\nb.jpg 1 2",
+        "c.jpg 1 2 3 4 5 6 7 8 fixed 30 sats",
+        "d.jpg 1 2 RTK",
+        "v1.old shots/IMG1 1 2",
+        "IMG 2024 01 15 x.jpg 1 2 3 fixed",
+    ]
+    (tmp_path / "geo.txt").write_text("EPSG:4326\n" + "\n".join(lines))
+    names = ("DJI 0001 (2).jpg", "b.jpg", "c.jpg", "d.jpg", "IMG1", "IMG 2024 01 15 x.jpg")
+    sources = [Source(Path(name), Metadata((640, 480)), Camera((640, 480))) for name in names]
+    places = [source.metadata.gps for source in with_positions(sources, tmp_path / "geo.txt")]
+    assert [place and (place.longitude, place.latitude, place.altitude) for place in places] == [
+        (12.5, 48.0, -3.0),
+        (1.0, 2.0, None),
+        (1.0, 2.0, 3.0),
+        (1.0, 2.0, None),
+        (1.0, 2.0, None),
+        (1.0, 2.0, 3.0),
+    ]
+
+
+@pytest.mark.parametrize("name", ["IMG 2024 01 15 a.jpg", "a,b.jpg"])
+def test_tables_below_a_comment_hold_any_name(tmp_path: Path, name: str) -> None:
+    (tmp_path / "p").write_text(f'EPSG:4326\n# name,x,y\n"{name}",1,2\n'.replace('"', '"' if "," in name else ""))
+    (source,) = with_positions([Source(Path(name), Metadata((64, 48)), Camera((64, 48)))], tmp_path / "p")
+    assert source.metadata.gps == GpsPosition(2.0, 1.0)
 
 
 def test_positions_that_tell_no_accuracy_get_the_one_given(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from rdstitch.errors import InputError
 from rdstitch.inputs.find import find_images
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.rows_of_images import RowsByImage
-from rdstitch.inputs.tables import Row, csv_rows, json_rows, listed_rows
+from rdstitch.inputs.tables import Row, csv_rows, json_rows
 
 COLUMNS = {"name": "name file image", "x": "x easting", "y": "y northing", "um": "xum"}
 
@@ -111,27 +111,6 @@ def test_a_row_is_about_the_image_whose_path_ends_like_its_name(
             table.of(frames)
     else:
         assert [row and row.number("x") for row in table.of(frames)] == found
-
-
-def test_names_in_lists_hold_blanks_and_words_follow_the_numbers() -> None:
-    lines = [
-        "DJI 0001 (2).jpg 12.5 48 -3",
-        "# no\n\nb.jpg 1 2",
-        "c.jpg 1 2 3 4 5 fixed 30 sats",
-        "d.jpg 1 2 RTK",
-        "v1.old shots/IMG1 1 2",
-        "IMG 2024 01 15 x.jpg 1 2 3 fixed",
-    ]
-    rows = listed_rows("\n".join(lines), "geo.txt", ("name", "x", "y", "z", "accuracy", "up"))
-    assert [(row.image, *(row.number(column) for column in "xyz")) for row in rows] == [
-        ("DJI 0001 (2).jpg", 12.5, 48.0, -3.0),
-        ("b.jpg", 1.0, 2.0, None),
-        ("c.jpg", 1.0, 2.0, 3.0),
-        ("d.jpg", 1.0, 2.0, None),
-        ("IMG1", 1.0, 2.0, None),
-        ("IMG 2024 01 15 x.jpg", 1.0, 2.0, 3.0),
-    ]
-    assert rows[1].where == "geo.txt: line 4"
 
 
 def test_zero_in_json_is_a_number() -> None:

@@ -175,6 +175,18 @@ def test_neighbours_with_partners_in_common_are_not_tried_again_but_loops_are_cl
     assert all(j - i > 12 or i < 6 or j > count - 7 for i, j in found)
 
 
+def test_pairs_that_failed_make_no_partners_and_are_not_tried_again() -> None:
+    """Two rows of a survey, registered along the rows only."""
+    row, camera = 20, Camera((640, 480))
+    homographies = np.tile(np.eye(3), (2 * row, 1, 1))
+    homographies[:, 0, 2], homographies[:, 1, 2] = np.tile(np.arange(row) * 0.3, 2), np.repeat([0.0, 0.6], row)
+    along = {(i, j) for i in range(2 * row) for j in range(i + 1, i + 4) if j < (i // row + 1) * row}
+    failed = {(k, row + k + 3) for k in range(row - 3)} | {(k, row + k - 3) for k in range(3, row)}
+    untouched, found = (loop_closures([camera] * 2 * row, homographies, along, without) for without in (set(), failed))
+    assert {(k, row + k) for k in range(row)} <= set(found)
+    assert set(found) == set(untouched) - failed
+
+
 @pytest.mark.parametrize("focal", [0.4, 1.0, 4.0])
 def test_of_a_turn_neighbours_are_those_that_see_a_part_of_each_other(focal: float) -> None:
     """A full circle: the next images, as far as their angle of view reaches, also across where the circle closes."""

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.lens_votes import LensVotes
-from rdstitch.matching.mixed_lenses import TwoLenses, two_lenses
+from rdstitch.matching.mixed_lenses import TwoLenses, separate_lenses, two_lenses
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust import estimate_radial_homography
 
@@ -20,15 +21,30 @@ LENS = Camera((640, 480), -0.2, focal=520.0)
 
 @pytest.mark.parametrize(("count", "votes"), [(20, 0), (29, 0), (30, 1), (120, 1)])
 def test_few_inliers_have_no_vote(count: int, votes: int) -> None:
+    pair = _pair(0, 1, count)
+    assert pair.relation.inliers.all()
+    assert len(LensVotes.of([pair], 3.0)) == votes
+
+
+def _pair(i: int, j: int, count: int, lens1: Camera = LENS, lens2: Camera = LENS) -> PairRegistration:
     rng = np.random.default_rng(count)
     points1 = rng.uniform((150.0, 100.0), (490.0, 380.0), (count, 2))
-    flat = LENS.undistort(points1)
-    points2 = LENS.distort(flat @ np.array([[0.96, 0.28], [-0.28, 0.96]]).T + (-130.0, 110.0))
+    flat = lens1.undistort(points1)
+    points2 = lens2.distort(flat @ np.array([[0.96, 0.28], [-0.28, 0.96]]).T + (-130.0, 110.0))
     points2 += rng.normal(scale=0.1, size=points2.shape)
     relation = estimate_radial_homography(points1, points2, LENS.image_size, focal=520.0)
-    assert relation.inliers.all()
-    pair = PairRegistration(0, 1, stored(points1, points2), relation)
-    assert len(LensVotes.of([pair], 3.0)) == votes
+    return PairRegistration(i, j, stored(points1, points2), relation)
+
+
+def test_images_without_votes_go_with_whichever_lens_is_kept() -> None:
+    first, second = LENS, replace(LENS, distortion=-0.1)
+    pairs = [_pair(i, j, 80, first, first) for i, j in ((0, 1), (0, 2), (1, 2))]
+    pairs += [_pair(i, j, 120, second, second) for i, j in ((3, 4), (3, 5), (4, 5))]
+    pairs += [_pair(2, 3, 90, first, second), _pair(1, 4, 90, first, second)]
+    few = [_pair(5, 6, 20, second, second), _pair(6, 7, 20, second, second), _pair(0, 8, 20, first, first)]
+    mixed, left_out = separate_lenses([LENS] * 9, [*pairs, *few], 3.0, None)
+    assert mixed.certain
+    assert left_out.keys() == {0, 1, 2}
 
 
 def _votes(distortion: list[list[float]], covariance: FloatArray) -> LensVotes:

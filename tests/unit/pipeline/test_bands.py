@@ -11,9 +11,9 @@ import tifffile
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.export.map_grid import read_grid
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
+from rdstitch.georeferencing.map_grid import read_grid
 from rdstitch.inputs.find import find_images
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.stitch_options import StitchOptions

@@ -108,6 +108,13 @@ def test_images_are_compared_small_and_grey(dtype: type) -> None:
     np.testing.assert_allclose(low.grey, 0.5, rtol=0.02)
 
 
+def test_images_of_many_bands_are_compared() -> None:
+    """More than the four channels that OpenCV makes smaller by a share."""
+    bands = np.arange(10, 15, dtype=np.uint8) * np.ones((600, 900, 1), np.uint8)
+    made = ComparedImage.of(DecodedImage(bands, None, Metadata((900, 600))), Camera((900, 600)), np.eye(3))
+    np.testing.assert_allclose(made.grey, 12.0 / 255.0, rtol=1e-5)
+
+
 def _fit(i: int, j: int, inliers: int = 50) -> LinkFit:
     return LinkFit(i, j, 100, inliers, 0.5, True)
 

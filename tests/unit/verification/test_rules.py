@@ -207,7 +207,7 @@ def _texts(*sources: Source) -> list[str]:
     return [message.text for message in messages_of(rules._inputs(evidence(given)), given)]
 
 
-@pytest.mark.parametrize("other", [{"model": "B"}, {"model": "A", "serial": "2"}, {"make": "X", "model": "A"}])
+@pytest.mark.parametrize("other", [{"model": "B"}, {"model": "B", "serial": "1"}, {"make": "X", "model": "A"}])
 def test_several_cameras_are_named_the_commonest_first(other: dict[str, Any]) -> None:
     (text,) = _texts(source("z.jpg", **other), *(source(f"{k}.jpg", model="A") for k in range(2)))
     assert text.startswith("the images come from 2 cameras: A (2: 0.jpg, 1.jpg); ")
@@ -215,7 +215,11 @@ def test_several_cameras_are_named_the_commonest_first(other: dict[str, Any]) ->
 
 
 def test_images_of_one_camera_are_fine_a_serial_number_is_enough_and_no_header_is_no_camera() -> None:
-    assert _texts(*(source(f"{k}.jpg", model="A", serial="1", focal_px=900.0) for k in range(3))) == []
+    one = [source(f"{k}.jpg", model="A", serial="1", focal_px=900.0) for k in range(3)]
+    edited = source("edited.jpg", model="A")
+    assert _texts(*one) == _texts(*one, edited) == []
+    (text,) = _texts(*one, edited, source("other.jpg", model="A", serial="2"))
+    assert text.startswith("the images come from 2 cameras: A 1 (3: 0.jpg, 1.jpg, 2.jpg); A 2 (1: other.jpg); ")
     assert _texts(source("a"), source("b")) == _texts() == []
     assert len(_texts(source("a", serial="1"), source("b", serial="2"))) == 1
     assert _texts(source("a", serial="1"), source("b", make="X")) == []
@@ -230,6 +234,27 @@ def test_a_lens_that_was_zoomed_is_noticed(focal: float, zoomed: bool) -> None:
         near, far = ("a.jpg", "b.jpg") if focal > 900 else ("b.jpg", "a.jpg")
         ratio = max(focal, 900.0) / min(focal, 900.0)
         assert f"by up to {ratio:.2f} (between {near} and {far})" in found[0]
+
+
+@pytest.mark.parametrize(
+    ("size", "focal_px", "focal_mm", "zoomed"),
+    [
+        ((4000, 2250), 2546.0, 8.8, False),  # crops whose tag of 35 mm, 24, was left as it is
+        ((3000, 3000), 2353.0, 8.8, False),
+        ((2000, 1500), 1387.0, 12.8, True),
+        ((4000, 3000), 5547.0, 8.8, True),  # by the camera's program
+        ((3000, 4000), 3200.0, None, True),
+        ((4000, 2250), 3200.0, None, False),  # a crop, or not: nobody knows
+    ],
+)
+def test_a_crop_is_no_zoom(size: tuple[int, int], focal_px: float, focal_mm: float | None, zoomed: bool) -> None:
+    first, second = (
+        source("a.jpg", focal_px=2773.0, focal_mm=8.8),
+        source("b.jpg", focal_px=focal_px, focal_mm=focal_mm),
+    )
+    headers = replace(first.metadata, size=(4000, 3000)), replace(second.metadata, size=size)
+    sources = [replace(each, metadata=header) for each, header in zip((first, second), headers, strict=True)]
+    assert bool(_texts(*sources)) is zoomed
 
 
 def test_images_without_a_mask_among_others_are_named() -> None:

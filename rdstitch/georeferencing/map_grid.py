@@ -7,8 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch.errors import InputError
-from rdstitch.export.georeference import GEO_KEYS, MODEL_SCALE, MODEL_TIEPOINT, MODEL_TRANSFORMATION, Georeference
 from rdstitch.geometry.crs import Crs, NotMetricError
+from rdstitch.georeferencing.georeference import (
+    GEO_KEYS,
+    MODEL_SCALE,
+    MODEL_TIEPOINT,
+    MODEL_TRANSFORMATION,
+    Georeference,
+)
 from rdstitch.io.opening import check_readable, decoding
 from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile

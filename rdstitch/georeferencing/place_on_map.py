@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.export.camera_views import Views, as_complex, views_of
-from rdstitch.export.georeference import CONTROL, GPS, Georeference, PositionKind, Residual, metres
-from rdstitch.export.map_fit import MapFit, Measured, fit_map
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import WGS84, Crs, middle
 from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import to_plane
+from rdstitch.georeferencing.camera_views import Views, as_complex, views_of
+from rdstitch.georeferencing.georeference import CONTROL, GPS, Georeference, PositionKind, Residual, metres
+from rdstitch.georeferencing.map_fit import MapFit, Measured, fit_map
 from rdstitch.inputs.source import Source
 
 MIN_POSITIONS = 3
@@ -112,7 +112,7 @@ class _MeasuredPlaces:
     source: PositionKind
     names: Sequence[str]
     places: Sequence[GpsPosition]
-    altitude: FloatArray  # altitude, std, leverage: as :class:`rdstitch.export.map_fit.Measured` has them
+    altitude: FloatArray  # altitude, std, leverage: as :class:`rdstitch.georeferencing.map_fit.Measured` has them
     std: FloatArray
     leverage: Sequence[float]
 

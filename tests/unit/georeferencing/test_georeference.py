@@ -14,13 +14,13 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import camera_file_text
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, OutputError
-from rdstitch.export.georeference import Georeference, map_summary, world_file_paths
-from rdstitch.export.place_on_map import Located, place_on_map
 from rdstitch.export.poses_files import poses_file, poses_table
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
 from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import from_plane, to_plane
+from rdstitch.georeferencing.georeference import Georeference, map_summary, world_file_paths
+from rdstitch.georeferencing.place_on_map import Located, place_on_map
 from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.io import ImageSpec, write_strips
 from rdstitch.options.stitch_options import StitchOptions

@@ -1,7 +1,7 @@
 """The output's place on the Earth: as GeoTIFF tags, as a world file, and in words.
 
 The output is a plane seen straight from above, so that a similarity takes its pixels to map coordinates. See
-:mod:`rdstitch.export.map_fit` for how it is fitted.
+:mod:`rdstitch.georeferencing.map_fit` for how it is fitted.
 """
 
 import math
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
-from rdstitch.export.camera_views import as_complex
 from rdstitch.geometry.crs import Crs, middle
+from rdstitch.georeferencing.camera_views import as_complex
 from rdstitch.io.tiff import ExtraTag
 
 PositionKind = Literal["GPS positions", "ground control points"]
