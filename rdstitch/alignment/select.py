@@ -90,7 +90,7 @@ class Posterior:
     @cached_property
     def least_field(self) -> float:
         """Pixels: what neighbours share of the errors of links on their own, which no model undercuts by much."""
-        return float(self.evidence.cost(self.link_errors).field[0])
+        return float(self.evidence.field(self.link_errors)[0])
 
     @cached_property
     def tolerable(self) -> float:
@@ -100,7 +100,7 @@ class Posterior:
     def scored(self, fit: Fit) -> Hypothesis:
         """Score a fit."""
         # Of any model what its errors show, whatever its freedom costs: it is held against what seams can hide.
-        field = float(self.evidence.cost(fit.adjusted.errors).field[0])
+        field = float(self.evidence.field(fit.adjusted.errors)[0])
         layout = stretch(fit) if self.purpose.picture else 1.0
         spread = (fit.tilt_spread or 0.0) / _TYPICAL_TILT_SPREAD
         wide = 4.0 * self.problem.count * math.log(max(spread, 1.0))
@@ -112,7 +112,7 @@ class Posterior:
         """The score of a model that leaves such errors (M, 2), of a camera that is as cameras are."""
         free = parameter_count(self.problem, model, self.problem.free_lens if free_lens is None else free_lens)
         preference = TWENTY_TO_ONE if model.on_sphere != (self.purpose is Purpose.PANO) else 0.0
-        return float(self.evidence.cost(errors, free).cost[0]) + preference
+        return float(self.evidence.score(errors, free, preference)[0])
 
     def suffices(self, best: Hypothesis, model: MotionModel) -> bool:
         """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""

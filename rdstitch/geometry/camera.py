@@ -36,10 +36,6 @@ from rdstitch.geometry.planar_motion import turned_tilt
 LENS_PARAMETERS = ("distortion", "distortion2", "distortion3", "center_x", "center_y")
 """The parameters of a lens: λ, μ, ν, and the distortion centre, in the half-diagonal frame."""
 
-LENS_STD = np.array([0.5, 0.1, 0.03, 0.03, 0.03])
-"""Prior standard deviations of :data:`LENS_PARAMETERS` about 0. The series falls: an equisolid fisheye of 140° has
-λ = -0.50, μ = -0.05 and ν = -0.03, an equidistant one a third of that ν."""
-
 FOCAL_LOG_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "guess": 0.3}
 """Standard deviation of the logarithm of a focal length, by where it comes from."""
 

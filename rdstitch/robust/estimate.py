@@ -1,5 +1,6 @@
 """Homography and distortion of pairs of images from their matches: the public functions."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -17,6 +18,7 @@ from rdstitch.robust.measurements import Measurements, checked_matches, padded_l
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import ModelSelection, PairFit, StartedPairs, rms_of
 from rdstitch.robust.pair_models import PlanarPairModel
+from rdstitch.robust.posterior import Prior, focal_prior
 from rdstitch.robust.ransac import Hypotheses, ransac
 
 _NOT_IN_AUTO = "four_point"  # finds what three points find, from more samples
@@ -55,9 +57,14 @@ class PairMatches:
         return self.camera1.focal / self.camera1.scale
 
     @property
-    def batch_key(self) -> tuple[int, float, float, bool]:
+    def focal_prior(self) -> Prior:
+        """On the logarithm of the focal length."""
+        return focal_prior(math.log(self.focal), self.camera1.focal_log_std, self.camera1.focal_source or "guess")
+
+    @property
+    def batch_key(self) -> tuple[int, float, Prior, bool]:
         """What pairs that go on in lockstep have in common."""
-        return padded_length(len(self)), self.focal, self.camera1.focal_log_std, self.tilts is None
+        return padded_length(len(self)), self.focal, self.focal_prior, self.tilts is None
 
     @property
     def sizes(self) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -161,7 +168,7 @@ def estimate_radial_homographies(pairs: Sequence[PairMatches], options: Estimati
     if options.solver == "two_point" and any(pair.tilts is None for pair in pairs):
         raise ArgumentError("the two_point solver needs the tilt")
     result: dict[int, RadialHomography] = {}
-    batches: dict[tuple[int, float, float, bool], list[int]] = {}
+    batches: dict[tuple[int, float, Prior, bool], list[int]] = {}
     for index, pair in enumerate(pairs):
         if (cells := occupied_cells(pair.points1, pair.points2, *pair.sizes)) < MIN_OCCUPIED_CELLS:
             reason = f"only {len(pair)} matches, in {cells} places of the image"
@@ -185,7 +192,7 @@ def _estimate_batch(pairs: list[PairMatches], options: EstimationOptions) -> lis
     )
     known = [pair.tilts for pair in pairs if pair.tilts is not None]
     tilts = np.stack(known) if known else None
-    solvers = _solvers(options, pairs[0].focal, pairs[0].camera1.focal_log_std, tilts is not None)
+    solvers = _solvers(options, pairs[0].focal, pairs[0].focal_prior, tilts is not None)
     search = ransac(solvers, data, np.array([pair.quality is not None for pair in pairs]), tilts, options)
     fits = _selected(pairs[0], search.best, data, tilts, options)
     result = []
@@ -214,8 +221,8 @@ def _selected(
     few = best.inliers[solved].sum(axis=1) < limit
     selection = ModelSelection(options.threshold, options.distortion is not None)
     pairs = StartedPairs(data, best.homography, best.distortion, tilts)
-    std = pair.camera1.focal_log_std
-    planar = [PlanarPairModel(pair.focal, std, tilts is not None, height_free=free) for free in (False, True)]
+    prior = pair.focal_prior
+    planar = [PlanarPairModel(pair.focal, prior, tilts is not None, height_free=free) for free in (False, True)]
     fits: dict[int, PairFit] = {}
     for models, rows in ((planar, few), ([], ~few)):
         if rows.any():
@@ -237,12 +244,12 @@ def _tilts(tilt: ArrayLike | None) -> FloatArray | None:
     return np.broadcast_to(angles, (2, 2))
 
 
-def _solvers(options: EstimationOptions, focal: float, focal_std: float, tilts_known: bool) -> list[MinimalSolver]:
-    solvers = minimal_solvers(focal, focal_std, tilts_known, options.distortion)
+def _solvers(options: EstimationOptions, focal: float, prior: Prior, tilts_known: bool) -> list[MinimalSolver]:
+    solvers = minimal_solvers(focal, prior, tilts_known, options.distortion)
     if options.solver == "auto":
         return [solver for solver in solvers if solver.name != _NOT_IN_AUTO]
     if options.solver == "three_point":
-        solvers = minimal_solvers(focal, focal_std, False, options.distortion)
+        solvers = minimal_solvers(focal, prior, False, options.distortion)
     return [solver for solver in solvers if solver.name == options.solver]
 
 

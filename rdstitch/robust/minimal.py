@@ -10,6 +10,7 @@ from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.division_model import SEARCHED_DISTORTION
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
+from rdstitch.robust.posterior import Prior
 from rdstitch.solvers.solutions import Solutions
 
 # half-diagonal frame: so near to any lens up to a wide angle that some inliers agree
@@ -33,15 +34,15 @@ class MinimalSolver:
 
 @lru_cache(maxsize=64)
 def minimal_solvers(
-    focal: float, focal_std: float, tilts_known: bool, distortion: float | None
+    focal: float, focal_prior: Prior, tilts_known: bool, distortion: float | None
 ) -> tuple[MinimalSolver, ...]:
     """The solvers that the known quantities allow, those with the fewest points first.
 
-    ``focal``: focal length in half diagonals; ``focal_std``: standard deviation of its logarithm; ``tilts_known``:
-    whether the tilts of both images are known; ``distortion``: known λ in the half-diagonal frame.
+    ``focal``: focal length in half diagonals; ``focal_prior``: on its logarithm; ``tilts_known``: whether the tilts of
+    both images are known; ``distortion``: known λ in the half-diagonal frame.
     """
-    rigid = PlanarPairModel(focal, focal_std, tilts_known)
-    similarity = PlanarPairModel(focal, focal_std, tilts_known, height_free=True)
+    rigid = PlanarPairModel(focal, focal_prior, tilts_known)
+    similarity = PlanarPairModel(focal, focal_prior, tilts_known, height_free=True)
     if distortion is not None:
         known = distortion * focal**2
         points2 = partial(solvers.two_point_similarity, distortion=known)

@@ -11,7 +11,7 @@ from rdstitch.geometry.division_model import OBSERVABLE_STD
 from rdstitch.robust.loss import loss_width
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
-from rdstitch.robust.posterior import LENS, Evidence, farthest_error
+from rdstitch.robust.posterior import LENS, Evidence, farthest_error, prior_costs
 from rdstitch.robust.refinement import PairEquations, PairProblems, refine_pairs
 
 _STEPS = 20  # of refinement; halved or doubled, the median error of λ changes by a sixth at most
@@ -98,13 +98,6 @@ class ModelSelection:
                 free = index == len(planar)
                 why = f"{'no model with less freedom' if free else 'the least free model that'} explains the data"
                 result.update(finished(index, rows, why))
-        # A camera that turns on the spot moves like one beside a plane seen edge on, where tilt, focal length and λ
-        # cannot be distinguished; as a free homography the same images may show λ well.
-        unseen = [row for row, fit in result.items() if chosen[row] < len(planar) and np.isinf(fit.distortion_std)]
-        if unseen:
-            why = "models with less freedom explain the data, and do not show λ"
-            free_fits = finished(len(planar), np.array(sorted(unseen), dtype=np.intp), why)
-            result.update({row: fit for row, fit in free_fits.items() if np.isfinite(fit.distortion_std)})
         return [result[row] for row in range(len(pairs.data))]
 
     def _problems(self, model: PairModel, pairs: StartedPairs) -> PairProblems:
@@ -118,10 +111,9 @@ class ModelSelection:
 
     def _score(self, fitted: _Fitted, evidence: Evidence, row: IntArray, column: IntArray) -> FloatArray:
         """-2 log of the posterior of a model of each pair (B,), by the matches at these places, up to a constant."""
-        equations, distortion = fitted.equations, fitted.parameters[:, 0]
-        seen = evidence.cost(equations.transferred.whitened(row, column), equations.information.shape[1])
-        lens: FloatArray = np.array([0.0 if self.fixed_distortion else LENS[0].cost(x) for x in distortion.tolist()])
-        return seen.cost + equations.prior + lens
+        equations, distortion = fitted.equations, fitted.parameters[:, :1]
+        priors = equations.prior + (0.0 if self.fixed_distortion else prior_costs(LENS[:1], distortion)[:, 0])
+        return evidence.score(equations.transferred.whitened(row, column), equations.information.shape[1], priors)
 
     def _finished(self, fitted: _Fitted, pairs: StartedPairs, reasons: list[str]) -> list[PairFit]:
         """The chosen model with its covariance, and without λ where that is not observable."""

@@ -8,6 +8,7 @@ The functions of a model take the states of B pairs at once. The state of the pl
 ``(ψ1, θ1, ψ2, θ2, φ, tx, ty, log height, log focal correction)``; of these the free ones are estimated.
 """
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -23,6 +24,7 @@ from rdstitch.geometry.planar_motion import (
     rigid_in_plane,
     rotation_from_tilt,
 )
+from rdstitch.robust.posterior import Prior, prior_costs, prior_slopes
 
 _TILTS, _YAW, _TX, _TY, _HEIGHT, _FOCAL = slice(0, 4), 4, 5, 6, 7, 8
 _PSI, _THETA = (0, 2), (1, 3)
@@ -57,9 +59,10 @@ class HomographyPairModel:
         moved = state + np.einsum("bip,bp->bi", self.jacobian(state), step)
         return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
 
-    def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """None."""
-        return np.empty((len(state), 0)), np.empty((0, 8))
+        nothing = np.zeros((len(state), len(self.parameters)))
+        return nothing[:, 0], nothing, nothing
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class PlanarPairModel:
     """Planar motion ``H ~ K R2 Rz(φ) diag(1, 1, height) T R1' K⁻¹``, ``K = diag(focal, focal, 1)``."""
 
     focal: float  # focal length in half diagonals
-    focal_std: float = 0.0  # standard deviation of its logarithm; 0 fixes it
+    focal_prior: Prior | None = None  # on its logarithm; None fixes it
     tilts_known: bool = False  # whether the tilts of both images are known; otherwise they share an unknown one
     height_free: bool = False  # whether the height may change
 
@@ -96,7 +99,7 @@ class PlanarPairModel:
     @property
     def focal_free(self) -> bool:
         """Whether the focal length is corrected."""
-        return self.focal_std > 0.0 and not self.tilts_known
+        return self.focal_prior is not None and not self.tilts_known
 
     @property
     def name(self) -> str:
@@ -154,11 +157,14 @@ class PlanarPairModel:
         """Add the steps to the free entries."""
         return np.asarray(state + step @ self._directions)
 
-    def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The focal length, where it is free."""
-        if not self.focal_free:
-            return np.empty((len(state), 0)), np.empty((0, len(self._directions)))
-        return state[:, _FOCAL:] / self.focal_std, self._directions[:, _FOCAL][None] / self.focal_std
+    def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of the focal length, where it is free: its cost (B,), and the slope and curvature by a step (B, P)."""
+        slope, curvature = np.zeros((2, len(state), len(self.parameters)))
+        if self.focal_prior is None or self.tilts_known:
+            return slope[:, 0], slope, curvature
+        log_focal = math.log(self.focal) + state[:, _FOCAL:]
+        slope[:, -1:], curvature[:, -1:] = prior_slopes((self.focal_prior,), log_focal)
+        return prior_costs((self.focal_prior,), log_focal)[:, 0], slope, curvature
 
     def _parts(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotations of both images (B, 2, 3, 3) and the motion as the plane sees it (B, 3, 3)."""

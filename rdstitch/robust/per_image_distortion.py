@@ -11,16 +11,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.geometry.camera import LENS_STD
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.robust.levenberg_marquardt import descend
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel
+from rdstitch.robust.posterior import LENS, Prior
 from rdstitch.robust.refinement import PairProblems
 
 _HOMOGRAPHY = HomographyPairModel()
-_LENS_STD = LENS_STD[[0, 0, 1, 3, 4]]  # of λ of image 1, λ of image 2, μ, and the distortion centre
+_LENS = (Prior(), Prior(), LENS[1], *LENS[3:])
+"""Priors on λ of image 1, λ of image 2, μ, and the distortion centre. The votes of all pairs measure λ: a prior in each
+of them would count as often."""
+
 _ITERATIONS = 20
 
 
@@ -42,12 +45,12 @@ def estimate_per_image_distortion(
     ``relations``: one a pair; ``data``: also of what one λ could not explain; ``threshold``: largest transfer error of
     an inlier, pixels.
     """
-    count, lens = len(data), len(_LENS_STD)
+    count, lens = len(data), len(_LENS)
     parameters = np.zeros((count, lens + 9))
     parameters[:, :2] = [[relation.distortion] * 2 for relation in relations]
     parameters[:, lens:] = _HOMOGRAPHY.initialize(np.stack([relation.homography for relation in relations]))
     with np.errstate(all="ignore"):  # a step may leave the domain of the lens model
-        problems = PairProblems(_HOMOGRAPHY, data, np.full(count, threshold), lens_std=_LENS_STD)
+        problems = PairProblems(_HOMOGRAPHY, data, np.full(count, threshold), lens=_LENS)
         parameters, equations = descend(problems, parameters, _ITERATIONS)
         covariance = problems.covariances(parameters, equations)
         inliers = equations.squared < equations.scale[:, None] ** 2

@@ -2,8 +2,7 @@
 
 ``score = -2 log L(errors) - 2 log p(camera) + cost of freedom``, the smaller the better: how likely the errors are, how
 far the camera is off from what cameras are, and what the parameters cost: ``log n`` each by so many independent
-observations (Schwarz's approximation), or, where the posterior of a parameter is at hand, the logarithm of how many
-times narrower than its prior that is (Laplace's).
+observations (Schwarz's approximation).
 
 Errors are noise of the keypoints, and parts that neighbours share: depth, relief, or a lens of another kind move all
 points of a part of an overlap together. The errors ``e`` of a link are therefore taken as ``noise + field``, the field
@@ -39,15 +38,13 @@ tilt of a plane         0 ± 20°; 0 ± 45° (0.2)       what is laid flat is lo
 """
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.geometry.camera import LENS_STD
 
 TWENTY_TO_ONE = 6.0
 """What odds cost that are said beforehand: a richer lens is rarer, ``pano`` is for turns and ``mosaic`` for planes."""
@@ -78,19 +75,15 @@ class Prior:
 
     def cost(self, value: float) -> float:
         """-2 log of the density, relative to that of the core alone at its middle."""
-        if not self.parts:
-            return 0.0
-        logs = self._logs(value)
-        highest = max(logs)
-        return -2.0 * (highest + math.log(sum(math.exp(log - highest) for log in logs)))
+        return float(prior_costs((self,), np.array([value]))[0])
 
     def slope(self, value: float) -> float:
         """Half the derivative of the cost."""
-        return sum(weight * (value - mean) / std**2 for weight, (_, mean, std) in self._responsibilities(value))
+        return float(prior_slopes((self,), np.array([value]))[0][0])
 
     def curvature(self, value: float) -> float:
         """Half the second derivative of the cost where the weights of the parts stay as they are: positive."""
-        return sum(weight / std**2 for weight, (_, _, std) in self._responsibilities(value))
+        return float(prior_slopes((self,), np.array([value]))[1][0])
 
     def combined(self, value: float, std: float) -> float:
         """Where a measurement and the prior put the parameter: where their cost is least about its likeliest part."""
@@ -102,32 +95,39 @@ class Prior:
             found -= (self.slope(found) + (found - value) / std**2) / (self.curvature(found) + std**-2)
         return found
 
-    @cached_property
-    def _heights(self) -> list[float]:
-        """Logarithm of each part's density at its middle, relative to that of the core."""
-        weight, _, core = self.parts[0]
-        return [math.log(w / weight * core / std) for w, _, std in self.parts]
 
-    def _logs(self, value: float) -> list[float]:
-        return [
-            height - ((value - mean) / std) ** 2 / 2.0
-            for height, (_, mean, std) in zip(self._heights, self.parts, strict=True)
-        ]
-
-    def _responsibilities(self, value: float) -> list[tuple[float, tuple[float, float, float]]]:
-        """How likely the value comes from each part, with the part."""
-        if not self.parts:
-            return []
-        logs = self._logs(value)
-        highest = max(logs)
-        densities = [math.exp(log - highest) for log in logs]
-        total = sum(densities)
-        return [(density / total, part) for density, part in zip(densities, self.parts, strict=True)]
+Priors = tuple[Prior, ...]
 
 
-def of_each(of: Callable[[Prior, float], float], priors: Sequence[Prior], values: FloatArray) -> FloatArray:
-    """What the priors have of some parameters (K,): costs, slopes or curvatures."""
-    return np.array([of(prior, value) for prior, value in zip(priors, values.tolist(), strict=True)])
+def prior_costs(priors: Priors, values: FloatArray) -> FloatArray:
+    """The costs of K parameters (..., K)."""
+    return np.asarray(-2.0 * np.logaddexp.reduce(_logs(priors, values), axis=-1))
+
+
+def prior_slopes(priors: Priors, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The slopes and curvatures of the costs of K parameters (..., K)."""
+    logs, (_, mean, precision) = _logs(priors, values), _stacked(priors)
+    curvatures = precision * np.exp(logs - np.logaddexp.reduce(logs, axis=-1, keepdims=True))
+    slopes = curvatures * (values[..., None] - mean)
+    return slopes.sum(axis=-1), curvatures.sum(axis=-1)
+
+
+def _logs(priors: Priors, values: FloatArray) -> FloatArray:
+    """Logarithms of the densities of each part (..., K, J), relative to that of the core at its middle."""
+    height, mean, precision = _stacked(priors)
+    return height - precision * (values[..., None] - mean) ** 2 / 2.0
+
+
+@lru_cache(maxsize=64)
+def _stacked(priors: Priors) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Height, mean and inverse variance of each part, (K, J): where there is none, -inf; of no parts, a level one."""
+    stacked = np.zeros((3, len(priors), max([1, *(len(prior.parts) for prior in priors)])))
+    for row, prior in enumerate(priors):
+        stacked[0, row, max(len(prior.parts), 1) :] = -np.inf
+        for column, (weight, mean, std) in enumerate(prior.parts):
+            height = math.log(weight / prior.parts[0][0] * prior.parts[0][2] / std)
+            stacked[:, row, column] = height, mean, std**-2.0
+    return stacked[0], stacked[1], stacked[2]
 
 
 def exact(value: float) -> Prior:
@@ -142,8 +142,12 @@ def focal_prior(log_focal: float, std: float, source: str) -> Prior:
     return Prior(((0.9, log_focal, std), (0.1, math.log(1.5), 0.7)))
 
 
-LENS = (Prior(((0.9, 0.0, 0.04), (0.1, -0.35, 0.12))), *(Prior(((1.0, 0.0, std),)) for std in LENS_STD[1:].tolist()))
-"""Priors on :data:`rdstitch.geometry.camera.LENS_PARAMETERS`."""
+LENS = (
+    Prior(((0.9, 0.0, 0.04), (0.1, -0.35, 0.12))),
+    *(Prior(((1.0, 0.0, std),)) for std in (0.1, 0.03, 0.03, 0.03)),
+)
+"""Priors on :data:`rdstitch.geometry.camera.LENS_PARAMETERS`. The series falls: an equisolid fisheye of 140° has
+λ = -0.50, μ = -0.05 and ν = -0.03, an equidistant one a third of that ν."""
 
 WRONG_GIVEN_FOCAL = 0.02, 0.2
 """How often a given focal length is that of something else, and by how much its logarithm is off then."""
@@ -159,16 +163,6 @@ def overlap_cells(link: IntArray, points: FloatArray, count: int, side: int) -> 
     place = (points - low[link]) / np.maximum(high - low, 1e-12)[link]
     x, y = np.minimum((place * side).astype(np.intp), side - 1).T
     return x, y
-
-
-@dataclass(frozen=True, eq=False)
-class ErrorCost:
-    """What the errors of G problems say of a hypothesis, each array (G,)."""
-
-    cost: FloatArray  # -2 log of their likelihood, up to a constant of the problem, with what parameters cost
-    field: FloatArray  # size of what neighbours share, pixels of a coordinate
-    # independent coordinates: all where there is noise only, a pair of them a cell or block where the field is large
-    count: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,8 +205,19 @@ class Evidence:
             np.ones(len(noise)) if weight is None else weight,
         )
 
-    def cost(self, errors: FloatArray, parameters: int = 0) -> ErrorCost:
-        """How likely errors (M, 2), pixels, are that so many parameters leave, with the fields that are likeliest."""
+    def score(self, errors: FloatArray, parameters: int, priors: FloatArray | float = 0.0) -> FloatArray:
+        """-2 log of the posterior of a hypothesis on each problem (G,), up to a constant of the problem.
+
+        By the errors (M, 2), pixels, that so many parameters leave, and what these cost by their priors (G,).
+        """
+        return self._with_likeliest_field(errors, parameters)[0] + priors
+
+    def field(self, errors: FloatArray) -> FloatArray:
+        """Size of what neighbours share of errors (M, 2), pixels of a coordinate, (G,), whatever freedom costs."""
+        return self._with_likeliest_field(errors, 0)[1]
+
+    def _with_likeliest_field(self, errors: FloatArray, parameters: int) -> tuple[FloatArray, FloatArray]:
+        """What errors and parameters cost with the fields that make that least, and how large these are."""
         group, groups = self.group[self.block], len(self.noise)
         length, farthest = np.linalg.norm(errors, axis=1), self.farthest[group[self.cell]]
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -223,7 +228,7 @@ class Evidence:
         squared = np.einsum("ck,ck->c", mean, mean)
         sizes = np.geomspace(MODEL_ERROR, np.maximum(self.farthest, 2.0 * MODEL_ERROR), _SIZES)
         coarse = np.concatenate([np.zeros((1, groups)), sizes])
-        tried = list[tuple[FloatArray, FloatArray, FloatArray]]()
+        tried = list[tuple[FloatArray, FloatArray]]()
         for fine in sizes:
             # A cell's mean error has the variance of its noise and of its own field; blocks of cells share another one.
             variance = (fine**2)[group] + (self.noise**2)[group] / self.counts
@@ -236,15 +241,16 @@ class Evidence:
             # Of normal variables: log det Σ + r' Σ⁻¹ r, by cells with the blocks' fields taken out (Woodbury).
             of_cells = np.bincount(group, 2.0 * np.log(variance) + squared / variance, groups)
             fields = np.hypot(fine, coarse)
-            # Independent coordinates: the information that is left, in units of what one coordinate would have.
+            # Independent coordinates: the information that is left, in units of what one coordinate would have. All
+            # where there is noise only, a pair of them a cell or block where the field is large.
             left = np.stack([np.bincount(self.group, each, groups) for each in information / grown])
             counts = np.maximum(2.0 * self.weight * (fields**2 + self.noise**2) * left, 2.0)
             costs = np.stack([np.bincount(self.group, each, groups) for each in of_blocks])
             costs = self.weight * (of_cells + costs) + parameters * np.log(counts)
-            tried.append((costs, fields, counts))
-        costs, fields, counts = map(np.concatenate, zip(*tried, strict=True))
+            tried.append((costs, fields))
+        costs, fields = map(np.concatenate, zip(*tried, strict=True))
         least = np.argmin(costs, axis=0), np.arange(groups)
-        return ErrorCost(costs[least], fields[least], counts[least])
+        return costs[least], fields[least]
 
 
 def farthest_error(scale: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from rdstitch.robust.linearization import PairLenses, TransferDerivatives, diffe
 from rdstitch.robust.loss import loss_width, noise_of, robust_cost
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
+from rdstitch.robust.posterior import Priors, prior_costs, prior_slopes
 
 _STATE = 9  # numbers of a state of any pair model; before these, parameters have those of the lens
 
@@ -36,9 +37,9 @@ class PairEquations(BatchedNormalEquations):
 class PairProblems:
     """Refinement of B pairs as problems of least squares.
 
-    Parameters are ``(λ, state)``; where ``lens_std`` is given, ``(λ of image 1, λ of image 2, μ, centre, state)``.
-    Where no noise is given, it follows from the errors, and the width of the loss from it: the loss becomes narrow as
-    the fit becomes good.
+    Parameters are ``(λ, state)``; with priors on a ``lens``, ``(λ of image 1, λ of image 2, μ, centre, state)``. Where
+    no noise is given, it follows from the errors, and the width of the loss from it: the loss becomes narrow as the fit
+    becomes good.
     """
 
     model: PairModel
@@ -46,12 +47,12 @@ class PairProblems:
     scale: FloatArray  # (B,): of the loss, pixels; without ``noise`` the largest
     noise: FloatArray | None = None  # (B,): standard deviation of the errors per axis, pixels
     fixed_distortion: bool = False  # whether λ is known
-    lens_std: FloatArray | None = None  # (5,): standard deviations of the priors of the lens
+    lens: Priors | None = None  # on the parameters of the lens
 
     @property
     def free(self) -> int:
         """Number of parameters of the lens that are estimated."""
-        return 0 if self.fixed_distortion else 1 if self.lens_std is None else len(self.lens_std)
+        return 0 if self.fixed_distortion else 1 if self.lens is None else len(self.lens)
 
     def take(self, rows: BoolArray | IntArray) -> Self:
         """Some of them."""
@@ -61,7 +62,7 @@ class PairProblems:
     def transfer(self, parameters: FloatArray) -> TransferDerivatives:
         """The matches transferred, with derivatives by the entries of H and the lens."""
         lens = parameters[:, :-_STATE].T
-        lenses = PairLenses(lens[0]) if self.lens_std is None else PairLenses(lens[0], lens[1], lens[2], lens[3:].T)
+        lenses = PairLenses(lens[0]) if self.lens is None else PairLenses(lens[0], lens[1], lens[2], lens[3:].T)
         return differentiate(self.homography(parameters), lenses, self.data)
 
     def homography(self, parameters: FloatArray) -> FloatArray:
@@ -80,16 +81,14 @@ class PairProblems:
         information = np.swapaxes(jacobian, 1, 2) @ entries.information @ jacobian
         gradient = (entries.gradient[:, None] @ jacobian)[:, 0]
         weight = noise**2
-        residual, by_state = self.model.prior(parameters[:, -_STATE:])
-        prior = (residual**2).sum(axis=1)
-        if residual.shape[1]:
-            information[:, self.free :, self.free :] += weight[:, None, None] * (by_state.T @ by_state)
-            gradient[:, self.free :] += weight[:, None] * (residual @ by_state)
-        if self.lens_std is not None:
-            lens = parameters[:, :-_STATE] / self.lens_std
-            information[:, : self.free, : self.free] += weight[:, None, None] * np.diag(self.lens_std**-2.0)
-            gradient[:, : self.free] += weight[:, None] * lens / self.lens_std
-            prior = prior + (lens**2).sum(axis=1)
+        prior, slope, curvature = self.model.prior(parameters[:, -_STATE:])
+        # Of λ that all pairs share the prior is for all of them together.
+        by_lens = np.zeros((2, len(parameters), self.free))
+        if self.lens is not None:
+            prior = prior + prior_costs(self.lens, parameters[:, :-_STATE]).sum(axis=1)
+            by_lens = np.stack(prior_slopes(self.lens, parameters[:, :-_STATE]))
+        gradient += weight[:, None] * np.hstack([by_lens[0], slope])
+        np.einsum("bpp->bp", information)[...] += weight[:, None] * np.hstack([by_lens[1], curvature])
         cost = entries.cost + weight * prior
         return PairEquations(cost, information, gradient, entries.squared, scale, noise, prior, transferred)
 

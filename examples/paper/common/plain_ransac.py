@@ -1,5 +1,6 @@
 """Plain RANSAC, the same for every solver: no local optimisation, which would hide what the solvers differ in."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -12,6 +13,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver, Solve, minimal_solvers
 from rdstitch.robust.pair_models import HomographyPairModel
+from rdstitch.robust.posterior import focal_prior
 from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2
 from rdstitch.solvers import Solutions
@@ -28,7 +30,8 @@ def all_solvers(camera: Camera, tilt: tuple[float, float]) -> list[MinimalSolver
     ``camera``: with a focal length. ``tilt``: (ψ, θ), radians, for the solvers that are told it.
     """
     assert camera.focal is not None
-    given = partial(minimal_solvers, camera.focal / camera.scale, 0.01)
+    focal = camera.focal / camera.scale
+    given = partial(minimal_solvers, focal, focal_prior(math.log(focal), 0.01, "option"))
     told, untold, flat = given(True, None), given(False, None), given(True, 0.0)
     told = tuple(replace(solver, solve=_with_tilt(solver, tilt)) for solver in told)
     names = {

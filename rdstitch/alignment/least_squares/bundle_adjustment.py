@@ -26,7 +26,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.levenberg_marquardt import MAX_DAMPING, damping_by_gain
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
-from rdstitch.robust.posterior import Prior, of_each
+from rdstitch.robust.posterior import prior_costs, prior_slopes
 
 MIN_GAIN = 1e-5
 """Expected relative fall of the loss that is worth another step: a hundredth of the noise."""
@@ -283,8 +283,7 @@ class BundleAdjuster:
         With a focal length that grows without limit a turn becomes a shift over a plane, and ground a tilt.
         """
         physical = self.model.physical_parameters(parameters.shared)[0]
-        shared, lens = of_each(Prior.cost, self.priors.shared, physical), self.priors.lens
-        return float(shared.sum() + of_each(Prior.cost, lens, parameters.lens).sum())
+        return float(prior_costs(self.priors.camera, np.concatenate([physical, parameters.lens])).sum())
 
     def _prior_cost(self, parameters: Parameters) -> float:
         offsets = self.model.prior_coordinates(parameters.poses) - self.priors.poses
@@ -305,12 +304,11 @@ class BundleAdjuster:
             self.weight(sigma),
             self._of_marks(state),
         )
-        p, lens = self.priors, self.free.lens
+        p = self.priors
         physical, derivative = self.named_parameters(state.parameters.shared)
-        slope, precision = (
-            np.concatenate([of_each(of, p.shared, physical), of_each(of, p.lens, state.parameters.lens)[lens]])
-            for of in (Prior.slope, Prior.curvature)
-        )
+        estimated = np.concatenate([np.ones(len(physical), dtype=np.bool_), self.free.lens])
+        of_camera = prior_slopes(p.camera, np.concatenate([physical, state.parameters.lens]))
+        slope, precision = (one[estimated] for one in of_camera)
         poses = self.model.prior_coordinates(state.parameters.poses) - p.poses
         return normal.with_priors(
             p.poses_precision, poses, derivative.T @ (precision[:, None] * derivative), derivative.T @ slope

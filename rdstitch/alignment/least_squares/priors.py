@@ -5,6 +5,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -28,6 +29,11 @@ class Priors:
     poses: FloatArray  # poses, poses_precision: (N, D): means and inverse variances; 0 where there is no prior
     poses_precision: FloatArray
     marks: PlaneMarks | None = None
+
+    @cached_property
+    def camera(self) -> tuple[Prior, ...]:
+        """Of the named parameters and the lens."""
+        return self.shared + self.lens
 
     @classmethod
     def none(cls, model: MotionModel, count: int) -> Self:

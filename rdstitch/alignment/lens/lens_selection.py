@@ -13,12 +13,11 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, LinkProblem, Problem
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
-from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.noise import Coherence, coherence, evidence_of
 from rdstitch.alignment.pairwise import pairwise_homographies
 from rdstitch.arrays import BoolArray
-from rdstitch.geometry.camera import LENS_PARAMETERS, LENS_STD
-from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, Prior, of_each
+from rdstitch.geometry.camera import LENS_PARAMETERS
+from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, prior_costs
 
 LENSES: dict[str, tuple[str, ...]] = {
     "division": ("distortion",),
@@ -98,7 +97,7 @@ def choose_lens(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Seq
         fits.append(pairwise_homographies(links.at(fits[-1], free[index])))
         evidence = evidence_of(observations, fits[-1].errors)
         rarer = 0.0 if names[best] == "division2" else TWENTY_TO_ONE  # a series that was cut off has a next term
-        if _score(evidence, observations, fits[index]) + rarer < _score(evidence, observations, fits[best]):
+        if _score(evidence, fits[index]) + rarer < _score(evidence, fits[best]):
             best = index
     reason = _reason(names, fits, best)
     if few:
@@ -139,18 +138,10 @@ def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     return replace(problem, free_lens=finer), problem.extend(fit, finer)
 
 
-def _score(evidence: Evidence, observations: Observations, fit: BundleAdjustmentResult) -> float:
-    """-2 log of the posterior of a lens, up to a constant.
-
-    A parameter costs what Laplace says, by how much narrower it is than its prior: one that is hardly seen, such as the
-    next term of a series, costs next to nothing, and never less.
-    """
-    lens, free = fit.parameters.lens, fit.adjuster.free.lens
-    seen = evidence.cost(fit.errors)
-    shared = 2.0 * len(observations.points1) / float(seen.count[0])
-    relative = fit.covariance * shared / np.outer(LENS_STD[free], LENS_STD[free])
-    narrowed = -np.log(np.clip(np.linalg.eigvalsh(relative), 1e-300, 1.0)).sum()
-    return float(seen.cost[0] + of_each(Prior.cost, LENS, lens).sum() + narrowed)
+def _score(evidence: Evidence, fit: BundleAdjustmentResult) -> float:
+    """-2 log of the posterior of a lens, up to a constant."""
+    parameters = int(fit.adjuster.free.lens.sum())
+    return float(evidence.score(fit.errors, parameters, prior_costs(LENS, fit.parameters.lens).sum())[0])
 
 
 def _reason(names: Sequence[str], fits: Sequence[BundleAdjustmentResult], best: int) -> str:

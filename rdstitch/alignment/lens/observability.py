@@ -14,7 +14,6 @@ from rdstitch.alignment.lens.lens_selection import LensChoice, choose_lens, resi
 from rdstitch.alignment.noise import COHERENT_CORRELATION, shows_relief
 from rdstitch.alignment.pairwise import pairwise_homographies, relations_at
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.geometry.camera import LENS_STD
 from rdstitch.geometry.division_model import OBSERVABLE_STD, PLAUSIBLE_DISTORTION
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.distortion_consensus import vote
@@ -34,7 +33,7 @@ def choose_observable_lens(
     def links_at(lens: FloatArray, free: BoolArray) -> LinkProblem:
         return LinkProblem(sample, relations_at(sample, relations, lens), lens, free, priors)
 
-    options, first, none = task.options, np.arange(len(LENS_STD)) == 0, np.zeros(len(LENS_STD), dtype=np.bool_)
+    options, first, none = task.options, np.arange(len(LENS)) == 0, np.zeros(len(LENS), dtype=np.bool_)
     # The images' points are already relative to the centre of the camera.
     given = np.array([*task.cameras[0].coefficients, 0.0, 0.0])
     if options.lens_known:

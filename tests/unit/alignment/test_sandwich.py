@@ -16,7 +16,7 @@ from rdstitch.alignment.noise import shared_variance
 from rdstitch.alignment.relief_field import ReliefField
 from rdstitch.alignment.uncertainty import sandwich_covariances
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.geometry.camera import LENS_STD, Camera
+from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.geometry.radial_homography import project
 from rdstitch.robust.posterior import Prior
 
@@ -60,7 +60,7 @@ def _miss(seed: int, shared_keypoints: bool) -> float:
     adjuster = BundleAdjuster(
         SIMILARITY,
         observations,
-        FreeParameters.fixing(SIMILARITY, 6, [0], np.arange(len(LENS_STD)) == 0),
+        FreeParameters.fixing(SIMILARITY, 6, [0], np.arange(len(LENS_PARAMETERS)) == 0),
         replace(Priors.none(SIMILARITY, 6), shared=KNOWN),
         shared_variance(observations, np.zeros((int(start[-1]), 2)), np.ones(int(start[-1]), dtype=np.bool_)),
     )

@@ -1,5 +1,6 @@
 """Minimal samples: which solver, in what order, and what its solutions are kept by."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from rdstitch.robust import SolverName, estimate_radial_homography
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import minimal_solvers
 from rdstitch.robust.per_image_distortion import PerImageDistortion, estimate_per_image_distortion
+from rdstitch.robust.posterior import focal_prior
 from rdstitch.robust.sampling import Sampler
 
 FOCAL = 1.4
@@ -35,7 +37,7 @@ def test_exact_samples_give_the_truth(tilts_known: bool, known: float | None) ->
     x2 = transfer(truth, DISTORTION, x1)
     probes = np.random.default_rng(4).uniform(-0.5, 0.5, (30, 2))
     expected = transfer(truth, DISTORTION, probes)
-    for solver in minimal_solvers(FOCAL, 0.1, tilts_known, known):
+    for solver in minimal_solvers(FOCAL, focal_prior(math.log(FOCAL), 0.1, "guess"), tilts_known, known):
         if solver.name.startswith("rotation"):
             continue  # for cameras that only turn
         if level and solver.name in ("three_point_similarity", "two_point_similarity"):
@@ -64,7 +66,7 @@ def test_the_whole_range_of_lenses_is_searched(distortion: float) -> None:
     truth = K @ r @ rigid_in_plane(0.3, (0.2, 0.1)) @ r.T @ np.linalg.inv(K)
     x1 = np.random.default_rng(5).uniform(-0.45, 0.45, (60, 2))
     x2 = transfer(truth, distortion, x1)
-    for solver in minimal_solvers(FOCAL, 0.1, False, None):
+    for solver in minimal_solvers(FOCAL, focal_prior(math.log(FOCAL), 0.1, "guess"), False, None):
         if solver.name in ("three_point_similarity", "four_point_dlt", "rotation_two_point"):
             continue
         size = solver.sample_size

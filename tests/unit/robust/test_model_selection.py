@@ -167,7 +167,7 @@ def _gain(each: int) -> float:
     """What errors that neighbours share gain by being a third smaller."""
     errors = _shared(5, each, 3.0).reshape(-1, 2)
     evidence = evidence_of(observations(errors.reshape(5, each, 2)), independent_errors(5, each, 0.2).reshape(-1, 2))
-    return float((evidence.cost(errors).cost - evidence.cost(errors / 1.5).cost)[0])
+    return float((evidence.score(errors, 0) - evidence.score(errors / 1.5, 0))[0])
 
 
 def test_shared_errors_count_alike_however_many_matches_there_are() -> None:
@@ -180,19 +180,19 @@ def test_noise_counts_match_by_match_and_a_field_cell_by_cell() -> None:
     each, links = 300, 5
     noise = independent_errors(links, each, 0.5).reshape(-1, 2)
     evidence = evidence_of(observations(noise.reshape(links, each, 2)), noise)
-    as_noise = evidence.cost(noise)
-    as_field = evidence.cost(_shared(links, each, 5.0).reshape(-1, 2))
-    assert as_noise.count > 0.5 * 2.0 * links * each
-    assert as_field.count < 2.5 * 16 * links
-    assert as_field.field[0] == pytest.approx(5.0, rel=0.5)
-    assert as_noise.field < 0.3
-    assert as_noise.cost < as_field.cost
+    field = _shared(links, each, 5.0).reshape(-1, 2)
+    as_noise, as_field = (math.exp((evidence.score(one, 1) - evidence.score(one, 0))[0]) for one in (noise, field))
+    assert as_noise > 0.5 * 2.0 * links * each
+    assert as_field < 2.5 * 16 * links
+    assert evidence.field(field)[0] == pytest.approx(5.0, rel=0.5)
+    assert evidence.field(noise) < 0.3
+    assert evidence.score(noise, 0) < evidence.score(field, 0)
 
 
 def test_next_to_the_same_errors_cost_next_to_the_same() -> None:
     errors = (_shared(5, 300, 1.0) + independent_errors(5, 300, 1.0)).reshape(-1, 2)
     evidence = evidence_of(observations(errors.reshape(5, 300, 2)), independent_errors(5, 300, 1.0).reshape(-1, 2))
-    costs = [evidence.cost(errors * size, parameters=60).cost[0] for size in np.geomspace(0.5, 4.0, 400)]
+    costs = [evidence.score(errors * size, 60)[0] for size in np.geomspace(0.5, 4.0, 400)]
     assert np.abs(np.diff(costs)).max() < 5.0
 
 
@@ -206,8 +206,8 @@ def test_what_cannot_be_transferred_counts_as_a_large_error() -> None:
     evidence = evidence_of(observations(errors.reshape(9, 60, 2)), errors)
     lost, far = errors.copy(), errors.copy()
     lost[::7], far[::7] = np.nan, 30.0 * SCALE
-    assert evidence.cost(errors).cost < evidence.cost(lost).cost < np.inf
-    assert evidence.cost(far).cost < np.inf
+    assert evidence.score(errors, 0) < evidence.score(lost, 0) < np.inf
+    assert evidence.score(far, 0) < np.inf
 
 
 def test_problems_that_are_compared_together_do_not_notice_each_other() -> None:
@@ -215,13 +215,12 @@ def test_problems_that_are_compared_together_do_not_notice_each_other() -> None:
     link, points = np.repeat([0, 1, 2], 80), rng.uniform(-0.6, 0.6, (240, 2))
     errors = rng.normal(0.0, 1.0, (240, 2)) * np.repeat([0.3, 2.0, 6.0], 80)[:, None]
     noise, scale = np.array([0.3, 0.5, 0.2]), np.array([400.0, 500.0, 600.0])
-    together = Evidence.of(link, points, np.arange(3), noise, scale).cost(errors)
+    together = Evidence.of(link, points, np.arange(3), noise, scale)
     for k in range(3):
         own = link == k
         alone = Evidence.of(link[own] * 0, points[own], np.zeros(1, dtype=np.intp), noise[[k]], scale[[k]])
-        found = alone.cost(errors[own])
-        for name in ("cost", "field", "count"):
-            assert getattr(found, name)[0] == pytest.approx(getattr(together, name)[k])
+        assert alone.score(errors[own], 3)[0] == pytest.approx(together.score(errors, 3)[k])
+        assert alone.field(errors[own])[0] == pytest.approx(together.field(errors)[k])
 
 
 EXIF = focal_prior(math.log(1.2), 0.05, "exif")

@@ -1,10 +1,13 @@
 """The family of pair models: derivatives, retraction, and where they start."""
 
+import math
+
 import numpy as np
 import pytest
 
 from rdstitch.geometry.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
+from rdstitch.robust.posterior import focal_prior
 
 MOTION = PlanarMotion((0.1, -0.15), 0.4, (0.3, -0.2), 1.15)
 K = np.diag([1.3, 1.3, 1.0])
@@ -12,10 +15,12 @@ H = K @ MOTION.homography() @ np.linalg.inv(K)
 
 TILTS = np.array([[[0.1, 0.0], [-0.05, 0.1]]])
 
+GUESS = focal_prior(math.log(1.3), 0.3, "guess")
+
 MODELS = [
     PlanarPairModel(1.3),
-    PlanarPairModel(1.3, 0.3),
-    PlanarPairModel(1.3, 0.3, height_free=True),
+    PlanarPairModel(1.3, GUESS),
+    PlanarPairModel(1.3, GUESS, height_free=True),
     PlanarPairModel(1.3, tilts_known=True, height_free=True),
     PlanarPairModel(1.3, tilts_known=True),
     HomographyPairModel(),

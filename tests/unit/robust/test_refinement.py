@@ -1,5 +1,7 @@
 """Refined pairs: models, parameters and their covariance."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from rdstitch.robust.covariance import covariances
 from rdstitch.robust.loss import robust_cost
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
+from rdstitch.robust.posterior import Prior, focal_prior
 from rdstitch.robust.refinement import PairProblems, refine_pairs
 
 LENS = Camera((640, 480))
@@ -18,6 +21,10 @@ FOCAL = 1.3
 K = np.diag([FOCAL, FOCAL, 1.0])
 H = K @ PlanarMotion((0.1, -0.05), 0.3, (0.2, -0.1)).homography() @ np.linalg.inv(K)
 DISTORTION = -0.2
+
+
+def log_focal(focal: float, std: float) -> Prior:
+    return focal_prior(math.log(focal), std, "option")
 
 
 def _data() -> Measurements:
@@ -37,7 +44,7 @@ def test_without_matches_only_the_prior_counts(fixed: bool) -> None:
     """``noise² (log focal correction / std)²``, with half its gradient and curvature; nothing on λ."""
     data = _data()
     nothing = data.only(np.zeros_like(data.present))
-    model = PlanarPairModel(FOCAL, 0.2)
+    model = PlanarPairModel(FOCAL, log_focal(FOCAL, 0.2))
     state = model.retract(model.initialize(H[None]), np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.1]]))
     problems = _problems(model, fixed=fixed, data=nothing)
     found = problems.normal_equations(np.column_stack([[DISTORTION], state]))
@@ -69,7 +76,11 @@ def test_steps_that_no_lens_allows_are_not_possible() -> None:
     np.testing.assert_array_equal(broken, start[:1])
 
 
-@pytest.mark.parametrize("model", [HomographyPairModel(), PlanarPairModel(FOCAL), PlanarPairModel(1.25, 0.1)], ids=repr)
+@pytest.mark.parametrize(
+    "model",
+    [HomographyPairModel(), PlanarPairModel(FOCAL), PlanarPairModel(1.25, log_focal(1.25, 0.1))],
+    ids=["homography", "focal known", "focal free"],
+)
 @pytest.mark.parametrize("fixed", [False, True])
 def test_it_comes_to_the_truth(model: PairModel, fixed: bool) -> None:
     shift = np.eye(3)
@@ -164,7 +175,8 @@ def test_without_matches_only_the_priors_of_the_lens_count() -> None:
     data = Measurements.from_pixels(points, points, LENS, LENS)
     none = data.only(np.zeros_like(data.present))
     lens, std = np.array([-0.3, -0.2, 0.05, 0.01, -0.02]), np.array([0.5, 0.5, 0.1, 0.03, 0.03])
-    problems = PairProblems(HomographyPairModel(), none, np.array([3.0]), np.array([0.5]), lens_std=std)
+    priors = tuple(Prior(((1.0, 0.0, each),)) for each in std.tolist())
+    problems = PairProblems(HomographyPairModel(), none, np.array([3.0]), np.array([0.5]), lens=priors)
     found = problems.normal_equations(np.concatenate([lens, np.eye(3).ravel() / np.sqrt(3.0)])[None])
     assert found.cost == pytest.approx(0.25 * np.square(lens / std).sum())
     np.testing.assert_allclose(found.gradient[0, :5], 0.25 * lens / std**2)
@@ -173,7 +185,7 @@ def test_without_matches_only_the_priors_of_the_lens_count() -> None:
 
 def test_priors_weigh_by_the_noise_that_they_are_compared_at() -> None:
     """A step changes the noise: what the prior cost before is compared with what it costs after by the same noise."""
-    model = PlanarPairModel(FOCAL, 1e-4)
+    model = PlanarPairModel(FOCAL, log_focal(FOCAL, 1e-4))
     problems = PairProblems(model, _data(), np.array([3.0]), None, False)
     start = model.initialize(H[None])
     near, far = (
