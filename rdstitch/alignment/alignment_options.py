@@ -8,7 +8,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.alignment.least_squares.plane_marks import ControlPoints, Sighting
+from rdstitch.alignment.least_squares.plane_marks import MILLIMETRE, ControlPoints, Sighting
 from rdstitch.alignment.least_squares.priors import CameraPriors, known_focal
 from rdstitch.alignment.lens.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
@@ -16,7 +16,11 @@ from rdstitch.arrays import FloatArray
 from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
+from rdstitch.inputs.delays import DELAYS
 from rdstitch.matching.links import Link
+
+FEWEST_MATCHES = 5
+"""Of a link: through four points goes a homography, whichever they are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +50,18 @@ class AlignmentOptions:
         for name, choices in (("model", get_args(ModelName)), ("lens", get_args(LensName))):
             if getattr(self, name) not in choices:
                 raise ArgumentError(f"{name} must be one of {', '.join(choices)}, not {getattr(self, name)!r}")
-        if self.tilt is not None and np.shape(self.tilt) != (2,):
-            raise ArgumentError(f"tilt must be (psi, theta) in radians, not {self.tilt!r}")
+        if self.tilt is not None and (np.shape(self.tilt) != (2,) or not np.isfinite(self.tilt).all()):
+            raise ArgumentError(f"tilt must be finite (psi, theta) in radians, not {self.tilt!r}")
         if not 0.0 <= self.attitudes_std < math.inf:
             raise ArgumentError(f"attitudes_std must be a standard deviation in radians, not {self.attitudes_std}")
-        if self.max_matches_per_link < 1:
-            raise ArgumentError("max_matches_per_link must be at least 1")
+        if self.max_matches_per_link < FEWEST_MATCHES:
+            raise ArgumentError(f"max_matches_per_link must be at least {FEWEST_MATCHES}")
+        points: dict[str, Sighting] = {}
+        for one in self.control:
+            first = points.setdefault(one.name, one)
+            if math.dist(one.place, first.place) > max(one.std or MILLIMETRE, first.std or MILLIMETRE):
+                far = math.dist(one.place, first.place)
+                raise ArgumentError(f"control point {one.name} has two places, {far:.3g} m apart")
 
     def exact_tilts(self, count: int) -> list[tuple[float, float]] | None:
         """(ψ, θ), radians, of each of ``count`` images, where they are known exactly; None where not."""
@@ -64,8 +74,11 @@ class AlignmentOptions:
         """As the adjustment needs it."""
         count = len(cameras)
         attitudes = _of_images("attitudes", self.attitudes, (count, 2), missing=0.0)
-        if not np.isfinite([*attitudes.ravel(), *(self.tilt or ())]).all():
-            raise ArgumentError("expected finite angles (psi, theta) of every image, and as tilt")
+        delayed = self.delayed_attitudes
+        if delayed is not None:
+            delayed = _of_images("delayed_attitudes", delayed, (count, len(DELAYS), 2))
+        if np.isnan(attitudes).any() or (delayed is not None and np.isnan(delayed).any()):
+            raise ArgumentError("expected finite angles (psi, theta) of every image")
         _of_images("gravity", self.gravity, (count, 3))
         positions_std = _of_images("positions_std", self.positions_std, (count,))
         if (positions_std <= 0.0).any():
@@ -77,7 +90,7 @@ class AlignmentOptions:
             attitudes=attitudes,
             attitudes_std=None if self.attitudes is None else self.attitudes_std,
             positions=_of_images("positions", self.positions, (count, 2)),
-            delayed_attitudes=self.delayed_attitudes,
+            delayed_attitudes=delayed,
             positions_std=positions_std,
             control=ControlPoints.of(self.control, cameras),
         )
@@ -119,4 +132,6 @@ def _of_images(name: str, given: ArrayLike | None, shape: tuple[int, ...], missi
     values = np.full(shape, missing) if given is None else np.asarray(given, dtype=np.float64)
     if values.shape != shape:
         raise ArgumentError(f"{name} must have the shape {shape}, one row for each image, not {values.shape}")
+    if np.isinf(values).any():
+        raise ArgumentError(f"{name} must be finite")
     return values

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster
-from rdstitch.alignment.least_squares.plane_marks import ControlPoints, PlaneMarks
+from rdstitch.alignment.least_squares.plane_marks import MILLIMETRE, ControlPoints, PlaneMarks
 from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.motion_models import X, Y
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
@@ -151,11 +151,12 @@ class _Control(_KnownPlaces):
         self.points = control = given.subset(shown)
         self.metres = control.places @ np.array([1.0, -1.0j])
         self.count = np.bincount(control.point, minlength=len(control.names))
-        self.std, self.labels, self.item = control.std, control.names, control.point
+        self.std, self.labels, self.item = np.maximum(control.std, MILLIMETRE), control.names, control.point
         if len(self.metres) >= self.min_count:
             places = self.estimated(fit)
             pixel = np.bincount(control.point, control.pixel) / self.count
-            self.std = np.hypot(control.std, _CLICK * pixel * abs(fit_similarity(places, self.metres, 0.0).scale))
+            scale = abs(fit_similarity(places, self.metres, float(np.median(self.std))).scale)
+            self.std = np.hypot(self.std, _CLICK * pixel * scale)
 
     def estimated(self, fit: Fit) -> ComplexArray:
         sums = np.zeros((len(self.metres), 2))

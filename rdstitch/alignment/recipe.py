@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
-from rdstitch.alignment.alignment_options import AlignmentOptions, GivenImages
+from rdstitch.alignment.alignment_options import FEWEST_MATCHES, AlignmentOptions, GivenImages
 from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_strained
@@ -49,9 +49,12 @@ _ROUNDS = 3  # rounds of rejecting wrong pairs and adjusting again
 def align(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions | None = None) -> Alignment:
     """Align all images of one lens over one plane, or around one centre, by pairs that overlap, each once.
 
+    Links of fewer than five matches, which show nothing, are left out.
+
     :exc:`ArgumentError` where two links are between the same images; :exc:`RegistrationError` where no two are linked.
     """
-    return AlignmentTask(cameras, links, options or AlignmentOptions()).result
+    enough = [link for link in links if len(link.points1) >= FEWEST_MATCHES]
+    return AlignmentTask(cameras, enough, options or AlignmentOptions()).result
 
 
 @dataclass(frozen=True, eq=False)

@@ -216,12 +216,16 @@ class Aligner:
             x, y = quarters.back.point(quarters.point(np.array(one.offset), one.image), first).tolist()
             control.append(replace(one, image=first, offset=(x, y)))
         upright = None if given.gravity is None else _filled(quarters.directions(given.gravity), copies)
+        known = None
+        if given.positions is not None:  # a place and its accuracy go together
+            std = np.full(len(self.cameras), math.nan) if given.positions_std is None else given.positions_std
+            known = _filled(np.column_stack([given.positions, std]), copies)
         return replace(
             given,
             reference=None if given.reference is None else copies.get(given.reference, given.reference),
             control=tuple(control),
-            positions=_filled(given.positions, copies),
-            positions_std=_filled(given.positions_std, copies),
+            positions=None if known is None else known[:, :2],
+            positions_std=None if known is None else known[:, 2],
             gravity=None if upright is None else quarters.back.directions(upright),
         )
 
@@ -257,13 +261,11 @@ class Aligner:
         return replace(self, options=replace(self.options, model="pose")).draft(aligned.pairs)
 
 
-def _filled(rows: ArrayLike | None, copies: Mapping[int, int]) -> FloatArray | None:
-    """Rows (N, …), one an image, those that are NaN from a copy of the image."""
-    if rows is None:
-        return None
+def _filled(rows: ArrayLike, copies: Mapping[int, int]) -> FloatArray:
+    """Rows (N, D), one an image, those that begin with NaN from a copy of the image."""
     result = np.array(rows, dtype=np.float64)
     for copy, first in copies.items():
-        if np.isnan(result[first]).any():
+        if np.isnan(result[first, 0]):
             result[first] = result[copy]
     return result
 

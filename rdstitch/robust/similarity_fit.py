@@ -33,8 +33,8 @@ def fit_similarity(source: Points, target: Points, std: float) -> SimilarityFit:
 
     Least quantile of squares: Rousseeuw and Leroy, Robust Regression and Outlier Detection (1987), section 3.4.
 
-    ``source, target`` (N,): two or more points; ``std``: standard deviation that targets have at least; the median
-    residual counts where that is more.
+    ``source, target`` (N,): two or more points; ``std``: standard deviation, positive, that targets have at least; the
+    median residual counts where that is more.
     """
     count = len(source)
     anchors = evenly_spaced(count, _ANCHORS)

@@ -338,14 +338,17 @@ def test_mistakes_of_the_caller() -> None:
         (lambda: align(lenses, [link], AlignmentOptions(lens_known=True)), "lenses that differ"),
         (lambda: AlignmentOptions(model="affine"), "model must be"),
         (lambda: AlignmentOptions(lens="brown"), "lens must be one of .*division-center"),
+        (lambda: AlignmentOptions(max_matches_per_link=4), "at least 5"),
         (lambda: replace(link, image2=0), "with itself"),
         (lambda: replace(link, points1=link.points1 * np.nan), "not finite"),
         (lambda: replace(link, relation=failed), "failed fit"),
     ):
         with pytest.raises(ArgumentError, match=says):
             wrong()
-    with pytest.raises(RegistrationError, match="no two images overlap"):
-        align(cameras, [])
+    few = replace(link, points1=link.points1[:4], points2=link.points2[:4])
+    for nothing in ([], [few]):
+        with pytest.raises(RegistrationError, match="no two images overlap"):
+            align(cameras, nothing)
 
 
 @pytest.mark.parametrize(
@@ -353,6 +356,10 @@ def test_mistakes_of_the_caller() -> None:
     [
         ({"attitudes_std": math.nan}, "attitudes_std"),
         ({"tilt": (0.1, 0.2, 0.3)}, "tilt must be"),
+        ({"tilt": (math.inf, 0.0)}, "tilt must be finite"),
+        ({"delayed_attitudes": np.zeros((2, 3, 2)), "attitudes": np.zeros((2, 2))}, "delayed_attitudes must have"),
+        ({"delayed_attitudes": np.full((2, 61, 2), np.nan), "attitudes": np.zeros((2, 2))}, "finite angles"),
+        ({"positions": np.full((2, 2), np.inf)}, "positions must be finite"),
         ({"attitudes": np.full((2, 2), np.nan)}, "finite angles"),
         ({"positions": np.zeros((2, 2)), "positions_std": np.zeros(2)}, "must be positive"),
         ({"positions": np.zeros((2, 2)), "positions_std": np.ones(1)}, "positions_std must have the shape"),
@@ -360,6 +367,7 @@ def test_mistakes_of_the_caller() -> None:
         ({"control": (Sighting(99, (0.0, 0.0), "P1", (0.0, 0.0)),)}, "P1 is in image 99"),
         ({"control": (Sighting(-1, (0.0, 0.0), "P1", (0.0, 0.0)),)}, "P1 is in image -1"),
         ({"control": (Sighting(0, (math.nan, 0.0), "P1", (0.0, 0.0)),)}, "P1: place, offset"),
+        ({"control": tuple(Sighting(k, (0.0, 0.0), "P1", (3.0 * k, 0.0), 2.0) for k in (0, 1))}, "places, 3 m apart"),
     ],
 )
 def test_what_cannot_be_of_the_images_is_refused(options: dict[str, object], named: str) -> None:

@@ -1,5 +1,6 @@
 """Positions and control points hold a chain in shape where the images agree with them, and do nothing elsewhere."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -166,3 +167,10 @@ def test_one_wrong_control_point_of_eight_does_no_harm() -> None:
     options = AlignmentOptions(model="similarity", lens="division", control=control)
     held = align(given.cameras, given.links, options)
     assert np.sqrt(np.mean(_off(held, checks) ** 2)) < 0.4 * np.sqrt(np.mean(_off(_without(0.3), checks) ** 2))
+
+
+def test_control_points_in_one_place_say_nothing() -> None:
+    given = _strip(0.15)
+    control = tuple(replace(one, place=(1.0, 2.0)) for one in _control(given, _along(given, 13))[0:8:2])
+    options = AlignmentOptions(model="similarity", lens="division", control=control)
+    assert align(given.cameras, given.links, options).leverage == {}

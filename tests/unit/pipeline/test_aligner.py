@@ -69,6 +69,14 @@ def test_what_a_copy_alone_has_is_given_of_its_image() -> None:
     assert np.isnan(given["positions"][0]).all()
 
 
+def test_a_position_keeps_its_accuracy_beside_a_copy_that_has_a_better_one() -> None:
+    options = AlignmentOptions(positions=[[0.0, 0.0], [9.0, 5.0]], positions_std=[np.nan, 0.02])
+    aligner = Aligner(("a", "b"), (Camera((640, 480)),) * 2, options, NO_CACHE, 3.0)
+    found = aligner._options_without({1: 0})
+    np.testing.assert_array_equal(found.positions, options.positions)
+    np.testing.assert_array_equal(found.positions_std, options.positions_std)
+
+
 @pytest.mark.parametrize(("relief", "noise"), [(0.08, 0.0), (0.0, 0.5)])
 def test_a_near_copy_over_relief_or_blurred_is_counted_once(relief: float, noise: float) -> None:
     """Its image is off as much where another copy, whose pair with it fits, is there as well; so are its own pairs."""
