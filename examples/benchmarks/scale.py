@@ -169,11 +169,8 @@ def print_row(row: dict[str, Any], first: dict[str, Any]) -> None:
     growth = (row["memory"] - first["memory"]) / max(count - first["count"], 1)
     line += f"{growth:10.2f}" if row is not first else f"{'':10s}"
     line += f"{row['used']:8d}{row['pairs'] / count:10.1f}{row['distortion'] - DISTORTION:11.6f}"
-    print(
-        line
-        + f"{row['local']:9.3f}{row['median']:9.3f}{row['largest']:9.3f}{100 * row['largest'] / row['path']:10.4f}",
-        flush=True,
-    )
+    line += f"{row['local']:9.3f}{row['median']:9.3f}{row['largest']:9.3f}{100 * row['largest'] / row['path']:10.4f}"
+    print(line, flush=True)
     for unit, values in (
         ("ms/frame", {stage: 1e3 * taken / count for stage, taken in row["stages"].items()}),
         ("MB", row["peaks"]),
@@ -197,22 +194,9 @@ def main(
         sequence, order = survey(counts[0], size, rendered=False), frame_order(counts[0], shuffled)
         print(json.dumps(measure(folder, sequence, order, workers, register_only=register, drawn=drawn)))
         return
-    columns = (
-        "s",
-        "ms/frame",
-        "ratio",
-        "MB",
-        "MB/frame",
-        "used",
-        "pairs/fr.",
-        "Δλ",
-        "local",
-        "median",
-        "largest",
-        "% of path",
-    )
-    widths = (10, 10, 8, 10, 10, 8, 10, 11, 9, 9, 9, 10)
-    print(f"{'frames':>8}" + "".join(f"{name:>{width}}" for name, width in zip(columns, widths, strict=True)))
+    widths = {"s": 10, "ms/frame": 10, "ratio": 8, "MB": 10, "MB/frame": 10, "used": 8, "pairs/fr.": 10, "Δλ": 11}
+    widths |= {"local": 9, "median": 9, "largest": 9, "% of path": 10}
+    print(f"{'frames':>8}" + "".join(f"{name:>{width}}" for name, width in widths.items()))
     first: dict[str, Any] | None = None
     for count in counts:
         with TemporaryDirectory() as rendered:

@@ -8,7 +8,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.alignment.least_squares.plane_marks import MILLIMETRE, ControlPoints, Sighting
+from rdstitch.alignment.least_squares.plane_marks import ControlPoints, Sighting
 from rdstitch.alignment.least_squares.priors import CameraPriors, known_focal
 from rdstitch.alignment.lens.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
@@ -16,6 +16,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.places import contradicting_places
 from rdstitch.inputs.delays import DELAYS
 from rdstitch.matching.links import Link
 
@@ -56,12 +57,9 @@ class AlignmentOptions:
             raise ArgumentError(f"attitudes_std must be a standard deviation in radians, not {self.attitudes_std}")
         if self.max_matches_per_link < FEWEST_MATCHES:
             raise ArgumentError(f"max_matches_per_link must be at least {FEWEST_MATCHES}")
-        points: dict[str, Sighting] = {}
-        for one in self.control:
-            first = points.setdefault(one.name, one)
-            if math.dist(one.place, first.place) > max(one.std or MILLIMETRE, first.std or MILLIMETRE):
-                far = math.dist(one.place, first.place)
-                raise ArgumentError(f"control point {one.name} has two places, {far:.3g} m apart")
+        names, places, stds = ([getattr(one, of) for one in self.control] for of in ("name", "place", "std"))
+        if (found := contradicting_places(names, places, stds)) is not None:
+            raise ArgumentError(f"control point {names[found[0]]} has two places, {found[2]:.3g} m apart")
 
     def exact_tilts(self, count: int) -> list[tuple[float, float]] | None:
         """(ψ, θ), radians, of each of ``count`` images, where they are known exactly; None where not."""

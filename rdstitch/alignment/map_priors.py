@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster
-from rdstitch.alignment.least_squares.plane_marks import MILLIMETRE, ControlPoints, PlaneMarks
+from rdstitch.alignment.least_squares.plane_marks import ControlPoints, PlaneMarks
 from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.motion_models import X, Y
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
+from rdstitch.geometry.places import MILLIMETRE
 from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 from rdstitch.robust.posterior import MODEL_ERROR
 from rdstitch.robust.similarity_fit import OUTLYING, SimilarityFit, fit_similarity

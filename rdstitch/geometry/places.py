@@ -1,6 +1,10 @@
 """Places on the Earth, of cameras and of points that images show."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+MILLIMETRE = 1e-3  # metres to which coordinates are written: no place is more exact
 
 
 @dataclass(frozen=True)
@@ -30,3 +34,16 @@ class GroundControl:
     pixel: tuple[float, float]
     std: float | None = None
     check: bool = False
+
+
+def contradicting_places(
+    names: Sequence[str], places: Sequence[tuple[float, float]], stds: Sequence[float | None]
+) -> tuple[int, int, float] | None:
+    """Two of some points (x, y), metres, of one name that are further apart than they are exact, and how far."""
+    first: dict[str, int] = {}
+    for k, name in enumerate(names):
+        one = first.setdefault(name, k)
+        apart = math.dist(places[one], places[k])
+        if apart > max(stds[one] or MILLIMETRE, stds[k] or MILLIMETRE):
+            return one, k, apart
+    return None

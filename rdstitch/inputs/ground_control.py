@@ -8,9 +8,17 @@ from typing import NamedTuple
 
 from rdstitch.errors import InputError
 from rdstitch.geometry.crs import WGS84, Crs
-from rdstitch.geometry.places import GpsPosition, GroundControl
+from rdstitch.geometry.places import GpsPosition, GroundControl, contradicting_places
 from rdstitch.inputs.named_system import NamedSystem
-from rdstitch.inputs.positions import COLUMNS, UNITS, Coordinates, accuracy_of, coordinates_of, geographic_places
+from rdstitch.inputs.positions import (
+    COLUMNS,
+    UNITS,
+    Coordinates,
+    accuracy_of,
+    coordinates_of,
+    geographic_places,
+    metres_around_median,
+)
 from rdstitch.inputs.rows_of_images import ImagesByName
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import Row, csv_rows, is_table, numbered_lines, numbers_before, rows_of
@@ -56,13 +64,21 @@ def with_ground_control(
     marks = _marks(rows, sources)
     if not marks:
         raise InputError(f"{file}: has no ground control point in any of the images")
-    places = geographic_places([mark.place for mark in marks], str(file), system)
+    places = [GpsPosition(*degrees) for degrees in geographic_places([mark.place for mark in marks], str(file), system)]
+    metres = metres_around_median(places).tolist()
+    found = contradicting_places([mark.point for mark in marks], metres, [mark.std for mark in marks])
+    if found is not None:
+        one, other = (marks[k] for k in found[:2])
+        raise InputError(
+            f"{other.place.where}: {other.point} is {found[2]:.3g} m from where it is by {one.place.where}; give it "
+            "one place, or other points another name"
+        )
     epsg = None if system is None else system.epsg
     crs = None if epsg in (None, WGS84) else Crs.in_metres(epsg)
     control = list(sources)
-    for mark, degrees in zip(marks, places, strict=True):
+    for mark, place in zip(marks, places, strict=True):
         code = WGS84 if crs is None or mark.place.geographic else crs.epsg
-        one = GroundControl(mark.point, GpsPosition(*degrees), code, mark.pixel, mark.std, check=check)
+        one = GroundControl(mark.point, place, code, mark.pixel, mark.std, check=check)
         control[mark.image] = replace(control[mark.image], control=(*control[mark.image].control, one))
     return control
 

@@ -96,15 +96,12 @@ class Prior:
         return found
 
 
-Priors = tuple[Prior, ...]
-
-
-def prior_costs(priors: Priors, values: FloatArray) -> FloatArray:
+def prior_costs(priors: tuple[Prior, ...], values: FloatArray) -> FloatArray:
     """The costs of K parameters (..., K)."""
     return np.asarray(-2.0 * np.logaddexp.reduce(_logs(priors, values), axis=-1))
 
 
-def prior_slopes(priors: Priors, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def prior_slopes(priors: tuple[Prior, ...], values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The slopes and curvatures of the costs of K parameters (..., K)."""
     logs, (_, mean, precision) = _logs(priors, values), _stacked(priors)
     curvatures = precision * np.exp(logs - np.logaddexp.reduce(logs, axis=-1, keepdims=True))
@@ -112,14 +109,14 @@ def prior_slopes(priors: Priors, values: FloatArray) -> tuple[FloatArray, FloatA
     return slopes.sum(axis=-1), curvatures.sum(axis=-1)
 
 
-def _logs(priors: Priors, values: FloatArray) -> FloatArray:
+def _logs(priors: tuple[Prior, ...], values: FloatArray) -> FloatArray:
     """Logarithms of the densities of each part (..., K, J), relative to that of the core at its middle."""
     height, mean, precision = _stacked(priors)
     return height - precision * (values[..., None] - mean) ** 2 / 2.0
 
 
 @lru_cache(maxsize=64)
-def _stacked(priors: Priors) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _stacked(priors: tuple[Prior, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Height, mean and inverse variance of each part, (K, J): where there is none, -inf; of no parts, a level one."""
     stacked = np.zeros((3, len(priors), max([1, *(len(prior.parts) for prior in priors)])))
     for row, prior in enumerate(priors):

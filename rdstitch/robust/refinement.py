@@ -13,7 +13,7 @@ from rdstitch.robust.linearization import PairLenses, TransferDerivatives, diffe
 from rdstitch.robust.loss import loss_width, noise_of, robust_cost
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
-from rdstitch.robust.posterior import Priors, prior_costs, prior_slopes
+from rdstitch.robust.posterior import Prior, prior_costs, prior_slopes
 
 _STATE = 9  # numbers of a state of any pair model; before these, parameters have those of the lens
 
@@ -47,7 +47,7 @@ class PairProblems:
     scale: FloatArray  # (B,): of the loss, pixels; without ``noise`` the largest
     noise: FloatArray | None = None  # (B,): standard deviation of the errors per axis, pixels
     fixed_distortion: bool = False  # whether λ is known
-    lens: Priors | None = None  # on the parameters of the lens
+    lens: tuple[Prior, ...] | None = None  # on the parameters of the lens
 
     @property
     def free(self) -> int:
@@ -82,7 +82,7 @@ class PairProblems:
         gradient = (entries.gradient[:, None] @ jacobian)[:, 0]
         weight = noise**2
         prior, slope, curvature = self.model.prior(parameters[:, -_STATE:])
-        # Of λ that all pairs share the prior is for all of them together.
+        # The prior on a λ that all pairs share counts once, where their votes come together.
         by_lens = np.zeros((2, len(parameters), self.free))
         if self.lens is not None:
             prior = prior + prior_costs(self.lens, parameters[:, :-_STATE]).sum(axis=1)

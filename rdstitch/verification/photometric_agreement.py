@@ -32,6 +32,7 @@ from rdstitch.verification.limits import Limits
 Grey = NDArray[np.float32]
 
 COMPARED_SIDE = 512  # pixels of the longer side of the images that are compared
+_RESIZED_CHANNELS = 4  # at most, that OpenCV makes smaller by a share
 CELL = 24  # pixels
 _SEARCH_RADIUS = 8  # pixels
 _OPAQUE = 250
@@ -100,9 +101,10 @@ def _reduced_grey(image: DecodedImage, stretch: tuple[float, float] | None) -> G
     height, width = pixels.shape[:2]
     factor = min(1.0, COMPARED_SIDE / max(width, height))
     size = max(1, round(width * factor)), max(1, round(height * factor))
-    # One channel first: OpenCV makes no more than four smaller by a share.
-    small = cv2.resize(mean_of_channels(pixels.astype(np.float32)), size, interpolation=cv2.INTER_AREA)
-    grey = np.asarray((small - black) / np.float32(full), dtype=np.float32)
+    if pixels.ndim == 3 and pixels.shape[2] > _RESIZED_CHANNELS:
+        pixels = mean_of_channels(pixels.astype(np.float32))
+    small = (cv2.resize(pixels, size, interpolation=cv2.INTER_AREA).astype(np.float32) - black) / np.float32(full)
+    grey = mean_of_channels(small)
     if image.alpha is not None:
         grey[cv2.resize(image.alpha, size, interpolation=cv2.INTER_AREA) < _OPAQUE] = np.nan
     return grey

@@ -14,8 +14,6 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.division_model import undistort
 from rdstitch.geometry.radial_homography import inverses
 
-MILLIMETRE = 1e-3  # metres to which coordinates are written: no place is more exact
-
 _STEP = 1e-6  # of a lens parameter, for derivatives
 
 

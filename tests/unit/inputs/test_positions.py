@@ -410,3 +410,13 @@ def test_every_kind_of_table_tells_images_of_one_name_in_two_folders(tmp_path: P
     ]
     places = grid_from_table([source.name for source in sources], tmp_path / "places", (32, 24), None).places
     assert (places[1] - places[0]).tolist() == [30, 0]
+
+
+@pytest.mark.parametrize("check", [False, True])
+def test_a_control_point_has_one_place(tmp_path: Path, check: bool) -> None:
+    rows = "500000 5300000 5 30 20 a.jpg corner\n500000.0004 5300000 5 30 20 b.jpg corner\n"
+    (tmp_path / "gcp").write_text(f"EPSG:32632\n{rows}", encoding="utf-8")
+    assert len(with_ground_control(_sources(), tmp_path / "gcp", check=check)[1].control) == 1
+    (tmp_path / "gcp").write_text(f"EPSG:32632\n{rows}500300 5300000 5 30 20 c.jpg corner\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"gcp: line 4: corner is 300 m from where it is by .*gcp: line 2"):
+        with_ground_control(_sources(), tmp_path / "gcp", check=check)
