@@ -68,10 +68,10 @@ def with_ground_control(
     metres = metres_around_median(places).tolist()
     found = contradicting_places([mark.point for mark in marks], metres, [mark.std for mark in marks])
     if found is not None:
-        one, other = (marks[k] for k in found[:2])
+        first, second = (marks[k] for k in found[:2])
         raise InputError(
-            f"{other.place.where}: {other.point} is {found[2]:.3g} m from where it is by {one.place.where}; give it "
-            "one place, or other points another name"
+            f"{second.place.where}: {second.point} is {found[2]:.3g} m from where it is by {first.place.where}; "
+            "give it one place, or other points another name"
         )
     epsg = None if system is None else system.epsg
     crs = None if epsg in (None, WGS84) else Crs.in_metres(epsg)
