@@ -16,6 +16,7 @@ from rdstitch.inputs.odometry import unit_quaternion
 from rdstitch.inputs.rows_of_images import RowsByImage
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, csv_rows
+from rdstitch.inputs.time_gaps import in_gap
 from rdstitch.inputs.times import timestamps_of
 from rdstitch.results.messages import shortened
 from rdstitch.system.file_access import cached_by_file_state, read_text
@@ -100,6 +101,8 @@ class _TimedAttitudes:
             raise InputError(
                 f"{file}: has attitudes from {first:.3f} to {last:.3f} s, not for {source.name}, {time:.3f} s"
             )
+        if in_gap(self.times, np.array([time]))[0]:
+            raise InputError(f"{file}: has no attitudes for a long time before and after {source.name}, {time:.3f} s")
         return np.stack([np.interp(time + DELAYS, self.times, values) for values in self.tilts.T], axis=1)
 
 

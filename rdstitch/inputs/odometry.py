@@ -12,6 +12,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
 from rdstitch.inputs.tables import TIME_NAMES, csv_rows, is_number, numbered_lines
+from rdstitch.inputs.time_gaps import in_gap
 from rdstitch.system.file_access import cached_by_file_state, read_text
 
 _COLUMNS = {"timestamp": TIME_NAMES} | {
@@ -61,8 +62,8 @@ class Odometry:
     poses: FloatArray  # (M, 5): as in BodyPose, the yaw continuous
 
     def at(self, time: float) -> BodyPose | None:
-        """The pose at a time, interpolated; None beyond what was measured."""
-        if not self.times[0] <= time <= self.times[-1]:
+        """The pose at a time, interpolated; None beyond what was measured, and in gaps."""
+        if not self.times[0] <= time <= self.times[-1] or in_gap(self.times, np.array([time]))[0]:
             return None
         return BodyPose(*(float(np.interp(time, self.times, values)) for values in self.poses.T))
 

@@ -11,6 +11,7 @@ import numpy as np
 from rdstitch.errors import InputError
 from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.source import Source
+from rdstitch.inputs.time_gaps import in_gap
 from rdstitch.inputs.times import timestamps_of
 from rdstitch.system.records import parse_xml
 
@@ -85,7 +86,7 @@ def track_points(text: str, file: str) -> list[tuple[float, float, float, float]
 def on_track(
     sources: Sequence[Source], points: Sequence[tuple[float, float, float, float]], file: str, offset: float
 ) -> list[GpsPosition | None]:
-    """Where the images are on a track, straight from point to point."""
+    """Where the images are on a track, straight from point to point; None beyond its ends, and in its gaps."""
     if not points:
         raise InputError(f"{file}: has no points with a time; give a GPX track or the subtitles (.SRT) of the video")
     seconds, latitude, longitude, altitude = np.array(sorted(points)).T
@@ -98,6 +99,7 @@ def on_track(
         )
     known = (latitude, np.unwrap(longitude, period=360.0), altitude)
     rows = np.stack([np.interp(times, seconds, values, left=np.nan, right=np.nan) for values in known], axis=1)
+    rows[in_gap(seconds, times)] = np.nan
     return [
         None if math.isnan(y) else GpsPosition(y, (x + 180.0) % 360.0 - 180.0, None if math.isnan(z) else z)
         for y, x, z in rows.tolist()
