@@ -21,7 +21,7 @@ from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatch
 _COARSE, _FINE = (12, 120_000), (24, 40_000)
 _SLOPES = (0.2, 0.06, 0.02)
 _SLOPE_OF_GROUND = 0.5  # one surface for all images: many matches determine it, and it may be freer
-_HELD_OUT = 5  # every fifth match
+_HELD_OUT = 5  # every fifth track: a keypoint brings its error to all its matches, fitted or not
 _WORTHWHILE = 0.15  # share by which what a person sees must get less for local alignment to be worth while
 # A person sees edges that do not go on across seams, as far as this percentile of the held-out residuals, and straight
 # edges, of a tenth of the diagonal or more, that fields bend up to this percentile: a single one is seen.
@@ -104,7 +104,7 @@ def align_locally(
     coarse, fine = (max(2, min(cells, math.isqrt(nodes // len(cameras)))) for cells, nodes in (_COARSE, _FINE))
     finest = max(coarse, math.isqrt(_COARSE[1] // len(cameras)))
     cells = max(coarse, fine) if choice == "auto" else min(choice, finest)
-    held_out = np.arange(len(placed)) % _HELD_OUT == 0
+    held_out = placed.tracks % _HELD_OUT == 0
     fitted, tested = placed.take(~held_out), placed.take(held_out)
     worthwhile = (1.0 - _WORTHWHILE) * _seam_residual(tested.residual)
     limit = worthwhile if choice == "auto" else math.inf

@@ -8,6 +8,8 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from rdstitch.arrays import FloatArray, Rows
 from rdstitch.geometry.camera import Camera
@@ -108,6 +110,14 @@ class PlacedMatches(Rows):
         order = np.argsort(self.images.ravel(), kind="stable")
         images, first = np.unique(self.images.ravel()[order], return_index=True)
         return tuple(zip(images.tolist(), np.split(order, first[1:]), strict=True))
+
+    @cached_property
+    def tracks(self) -> NDArray[np.intp]:
+        """For each match the number of its track: matches that share keypoints, and so their errors, have the same."""
+        keypoints = np.column_stack([self.images.ravel(), self.points.reshape(-1, 2)])
+        nodes = np.unique(keypoints, axis=0, return_inverse=True)[1].reshape(-1, 2)
+        links = coo_array((np.ones(len(nodes)), (nodes[:, 0], nodes[:, 1])), shape=(2 * len(nodes), 2 * len(nodes)))
+        return np.asarray(connected_components(links, directed=False)[1][nodes[:, 0]], dtype=np.intp)
 
     @cached_property
     def neighbours(self) -> NDArray[np.intp]:
