@@ -124,8 +124,10 @@ def test_relief_is_not_taken_for_lens(relief: float) -> None:
 def test_a_richer_lens_must_be_worth_its_price_and_not_be_far_off(seed: int) -> None:
     """Few matches over low hills: μ = .04 and a centre off by .08 half diagonals explain them somewhat better."""
     lens = Camera(SIZE, -0.05)
-    options = {"lens": lens, "focal": 420.0, "noise": 0.3, "outliers": 0.0, "per_link": 60, "relief": 0.02}
-    found = aligned(grid_scene(2, 2, (0.35, 0.3), 0.3, seed=seed, **options))
+    given = grid_scene(
+        2, 2, (0.35, 0.3), 0.3, seed=seed, lens=lens, focal=420.0, noise=0.3, outliers=0.0, per_link=60, relief=0.02
+    )
+    found = aligned(given)
     assert found.lens == "division"
     assert lens_distance(found.cameras[0], lens) < 1.0
 

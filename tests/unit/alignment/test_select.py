@@ -177,8 +177,11 @@ def test_two_images_of_a_turn_with_few_matches_are_a_turn(seed: int, purpose: Pu
 @pytest.mark.parametrize("seed", range(3))
 def test_a_plane_is_no_turn_of_a_camera_with_an_endless_focal_length(seed: int) -> None:
     """Short steps without a turn: rays of a long lens move as much, by two parameters less; a tilt has four more."""
-    options = {"lens": Camera(SIZE, -0.05), "focal": 480.0, "focal_source": "guess", "noise": 1.0, "outliers": 0.0}
-    found = aligned(grid_scene(3, 1, (0.08, 0.08), 0.0, seed=seed, per_link=40, **options))
+    given = grid_scene(
+        3, 1, (0.08, 0.08), 0.0, seed=seed, lens=Camera(SIZE, -0.05), focal=480.0, focal_source="guess", noise=1.0,
+        outliers=0.0, per_link=40,
+    )  # fmt: skip
+    found = aligned(given)
     assert found.model == "rigid"
 
 
