@@ -12,7 +12,7 @@ from rdstitch.alignment.least_squares.link_equations import split_lens
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import are_homographies, inverses, transfer_jacobian
-from rdstitch.matching.links import spread_choice
+from rdstitch.matching.links import grid_subsample
 
 _PROBES = 6  # points of a link that are transferred round each triangle
 
@@ -143,7 +143,7 @@ def _probes(observations: Observations, link: int, backward: bool) -> FloatArray
     """Points of a link in its image of lower index, shape (:data:`_PROBES`, 2), repeated where there are few."""
     rows = slice(observations.start[link], observations.start[link + 1])
     points = (observations.points2 if backward else observations.points1)[rows]
-    return np.resize(points[spread_choice(points, _PROBES)], (_PROBES, 2))
+    return np.resize(points[grid_subsample(points, _PROBES)], (_PROBES, 2))
 
 
 def _oriented(pairwise: BundleAdjustmentResult, backward: BoolArray) -> tuple[FloatArray, FloatArray]:

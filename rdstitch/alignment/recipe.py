@@ -33,9 +33,6 @@ from rdstitch.results.messages import Message
 
 # Side of an image, beside that of the largest, below which it was reduced, and must not set the scale of the output.
 _REDUCED = 0.8
-_UNCONFIRMED = 0.1
-"""What the matches count in the spanning tree of a link without a consistent triangle, relative to one with."""
-
 _MATCHES_OF_A_TURN = 5000
 """Correspondences of all links together that the final adjustment of a turn on the spot uses at least, if there are."""
 
@@ -247,12 +244,12 @@ def _check(given: GivenImages) -> None:
 
 
 def _tree_ranks(observations: Observations, confirmed: IntArray) -> FloatArray:
-    """Ranks of the links for the spanning tree: by their matches, and by the area of these where they are as many.
+    """Ranks of the links for the spanning tree: those with a consistent triangle first, by their matches, and by the
+    area of these where they are as many.
 
     Where all are as many, a tree of the first links may pass over neighbours, and join them a whole path away.
     """
-    matches = observations.matches * np.where(confirmed > 0, 1.0, _UNCONFIRMED)
-    return np.argsort(np.lexsort((observations.areas, matches))).astype(np.float64)
+    return np.argsort(np.lexsort((observations.areas, observations.matches, confirmed > 0))).astype(np.float64)
 
 
 def _drop_wrong_pairs(

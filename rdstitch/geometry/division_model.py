@@ -18,9 +18,6 @@ from rdstitch.arrays import FloatArray
 MAX_ABS_DISTORTION = 0.98
 """Largest ``|λ|`` that is estimated, half-diagonal frame; at 1 the model folds at the corner of the image."""
 
-PLAUSIBLE_DISTORTION = (-1.0, 0.5)
-"""Limits of λ: below, the corners would see behind the camera; no lens pulls its corners in as far as above."""
-
 SEARCHED_DISTORTION = (-0.95, 0.5)
 """Limits of λ that the sampling of pairs searches: from nearly folding barrel to strong pincushion distortion."""
 

@@ -18,12 +18,12 @@ from rdstitch.features.patch_shifts import Edges, coarse_shift, edges_of, patch_
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.inputs.source import Source
+from rdstitch.robust.posterior import MODEL_ERROR
 from rdstitch.system.late_imports import optimize
 
 _MAX_IMAGES = 8  # that are compared
 _AGREEING = 0.002  # diagonals of the image: patches that show a common shift
 _ENOUGH = 0.3  # of the patches must agree for a shift to be one
-_WORTH_CORRECTING = 0.2  # pixels: the error of a patch
 _ELSEWHERE = 0.01  # diagonals between images of one flight: parallax, and triggers that are not quite at one time
 _ROUNDS = 3
 
@@ -40,7 +40,7 @@ class BandLens:
     @property
     def is_same(self) -> bool:
         """Whether it is the lens that took the registered images, as far as can be told."""
-        return self.shift < max(_WORTH_CORRECTING, self.error)
+        return self.shift < max(MODEL_ERROR, self.error)
 
     def camera(self, camera: Camera) -> Camera:
         """The band's camera beside a registered one."""

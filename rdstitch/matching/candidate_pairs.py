@@ -49,7 +49,7 @@ def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None 
     """Pairs (i, j), i < j, to try before anything is known of the poses.
 
     Beyond :data:`EXHAUSTIVE_UP_TO` images, they are images that follow one another where the order means something,
-    those taken nearest to each other by ``positions`` (N, 2 or 3; NaN where not known), a few that each image is most
+    those taken nearest to each other by ``positions`` (N, 2; NaN where not known), a few that each image is most
     alike to, and those most alike of all, until there are :data:`CANDIDATES` an image in the mean.
     """
     count = len(features)
@@ -65,11 +65,11 @@ def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None 
         found = (features.counts > 0).tolist()
         best = ((i, j) for i, row in enumerate(alike.most_alike[:, :_RETRIEVED].tolist()) for j in row)
         chosen |= {(min(i, j), max(i, j)) for i, j in best if found[i] and found[j]}
-        chosen |= _most_alike(alike, chosen, CANDIDATES * count // 2)
+        chosen |= _top_pairs(alike, chosen, CANDIDATES * count // 2)
     return sorted(chosen)
 
 
-def _most_alike(alike: Similarity, chosen: set[Pair], total: int) -> set[Pair]:
+def _top_pairs(alike: Similarity, chosen: set[Pair], total: int) -> set[Pair]:
     """The pairs most alike of all besides those chosen, so many that there are ``total`` of both."""
     scores = sparse.triu(alike.scores, k=1).tocoo()
     best = np.argsort(-scores.data, kind="stable")
@@ -169,11 +169,11 @@ def loop_closures(
     untried = _nearest_pairs(centres, known, _NEIGHBOURS) - registered - failed
     pairs = [pair for pair in sorted(untried) if needed(*pair)]
     both = np.array([*pairs, *(pair[::-1] for pair in pairs)], dtype=np.intp).reshape(-1, 2)
-    seen = _shares_seen(cameras, homographies, both)
+    seen = _overlap_fractions(cameras, homographies, both)
     return [pair for pair, most in zip(pairs, seen.reshape(2, -1).max(axis=0), strict=True) if most >= _MIN_OVERLAP]
 
 
-def _shares_seen(cameras: Sequence[Camera], homographies: FloatArray, pairs: IntArray) -> FloatArray:
+def _overlap_fractions(cameras: Sequence[Camera], homographies: FloatArray, pairs: IntArray) -> FloatArray:
     """Share of the first image of each pair (M, 2) that the second shows, by places on a grid over it, (M,)."""
     fraction = (np.arange(_PLACES_PER_SIDE) + 0.5) / _PLACES_PER_SIDE
     grid = np.stack(np.meshgrid(fraction, fraction), axis=-1).reshape(-1, 2)

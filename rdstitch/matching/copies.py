@@ -13,7 +13,7 @@ from rdstitch.geometry.radial_homography import transfer
 from rdstitch.matching.two_view import Pair, PairRegistration
 
 SAME_PX = 0.5
-"""Pixels that matches of a copy move by at most: saving again moves them by less, and no place is off by more."""
+"""Pixels that matches of a copy move by at most: what moves by less stays on the same pixel."""
 
 _MIN_SAME = 0.9  # share of the matches that do: of an image that shows something else beside what is static, more move
 _NEAR = 0.02  # of the width and the height, that matches of a near copy move by at most: an overlap of 97 % at least
@@ -47,7 +47,7 @@ def near_copies_of(pairs: Mapping[Pair, PairRegistration]) -> dict[int, int]:
     return result
 
 
-def distinct(pairs: Sequence[PairRegistration], copies: Mapping[int, int]) -> dict[Pair, PairRegistration]:
+def without_copies(pairs: Sequence[PairRegistration], copies: Mapping[int, int]) -> dict[Pair, PairRegistration]:
     """The registered pairs that are evidence, by the images that they are between where copies are their first images.
 
     Where none but a copy was compared with an image, its pair stands for that.

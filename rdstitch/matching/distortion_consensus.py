@@ -1,7 +1,8 @@
 """λ by consensus: every pair votes, weighted by what it can know (Valtonen Örnhag et al., §5.5).
 
 The paper takes the peak of a histogram of the pairs' λ. Here the votes are weighted by their covariance, to which
-the scatter between pairs is added that the covariances do not explain.
+the scatter between pairs is added that the covariances do not explain. Far votes count as nothing, since one lens took
+the images: where that is the question, :meth:`rdstitch.matching.lens_votes.LensVotes.fitted` counts distances instead.
 """
 
 from dataclasses import dataclass

@@ -124,7 +124,9 @@ class StoredMatches:
             return matches
         before1, before2, after1, after2 = self.sizes
         return replace(
-            matches, points1=_moved(matches.points1, before1, after1), points2=_moved(matches.points2, before2, after2)
+            matches,
+            points1=_rescaled(matches.points1, before1, after1),
+            points2=_rescaled(matches.points2, before2, after2),
         )
 
     def resized(self, before: tuple[Size, Size], after: tuple[Size, Size]) -> Self:
@@ -142,10 +144,10 @@ def _at_size(features: Features, size: Size) -> Features:
     assert before is not None
     factor = Camera(size).scale / Camera(before).scale
     return replace(
-        features, points=_moved(features.points, before, size), scale=features.scale * factor, image_size=size
+        features, points=_rescaled(features.points, before, size), scale=features.scale * factor, image_size=size
     )
 
 
-def _moved(points: FloatArray, before: Size, after: Size) -> FloatArray:
+def _rescaled(points: FloatArray, before: Size, after: Size) -> FloatArray:
     """Points (N, 2) of one size in pixels of another: the same in half diagonals from the centre of the image."""
     return Camera(after).denormalize(Camera(before).normalize(points))

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.matching.links import spread_choice
+from rdstitch.matching.links import grid_subsample
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.per_image_distortion import PerImageDistortion, estimate_per_image_distortion
@@ -64,28 +64,28 @@ class LensVotes:
         whitened = np.einsum("lij,lj->li", self._whitening, self.distortion - expected)
         return np.asarray(np.linalg.norm(whitened, axis=1))
 
-    def which(self, second: BoolArray) -> IntArray:
+    def lens_index(self, second: BoolArray) -> IntArray:
         """From which lens, 0 or 1, the two images of each pair come, shape (L, 2)."""
         return np.stack([second[self.image1], second[self.image2]], axis=1).astype(np.intp)
 
-    def fitted(self, which: IntArray, lenses: FloatArray) -> FloatArray:
+    def fitted(self, lens_index: IntArray, lenses: FloatArray) -> FloatArray:
         """λ of the lenses that the votes miss by the least, by reweighted least squares.
 
-        ``which`` (L, 2): the lens of each image of each pair; ``lenses`` (K,): λ to start from; that of a lens without
-        votes stays.
+        ``lens_index`` (L, 2): the lens of each image of each pair; ``lenses`` (K,): λ to start from; that of a lens
+        without votes stays.
         """
         count, every = len(lenses), np.arange(len(lenses))
-        both = np.broadcast_arrays(which[:, :, None], which[:, None, :])
+        both = np.broadcast_arrays(lens_index[:, :, None], lens_index[:, None, :])
         places = tuple(np.concatenate([lens.ravel(), every]) for lens in both)
         information = np.swapaxes(self._whitening, 1, 2) @ self._whitening
         votes = np.einsum("lij,lj->li", information, self.distortion)
-        unseen = np.bincount(which.ravel(), minlength=count) == 0
+        unseen = np.bincount(lens_index.ravel(), minlength=count) == 0
         for _ in range(_REWEIGHTINGS):
             # The median, whatever it starts from: a loss that forgets far votes would settle on one of two lenses.
-            weight = 1.0 / np.maximum(self.mahalanobis_residuals(lenses[which]), _LEAST_RESIDUAL)
+            weight = 1.0 / np.maximum(self.mahalanobis_residuals(lenses[lens_index]), _LEAST_RESIDUAL)
             entries = np.concatenate([(information * weight[:, None, None]).ravel(), unseen])
             normal = sparse.coo_array((entries, places), shape=(count, count)).tocsc()
-            right = np.bincount(which.ravel(), (votes * weight[:, None]).ravel(), count)
+            right = np.bincount(lens_index.ravel(), (votes * weight[:, None]).ravel(), count)
             lenses = np.where(unseen, lenses, sparse_linalg.splu(normal).solve(right))
         return lenses
 
@@ -113,5 +113,5 @@ def _matches_near_one_lens(pair: PairRegistration, threshold: float) -> tuple[Fl
     matched = pair.correspondences
     error = np.linalg.norm(pair.relation.transfer(matched.points1) - matched.points2, axis=1)
     near = np.flatnonzero(error < _MAX_DISTANCE * threshold)
-    near = near[spread_choice(matched.points1[near], _MAX_MATCHES)]
+    near = near[grid_subsample(matched.points1[near], _MAX_MATCHES)]
     return matched.points1[near], matched.points2[near]

@@ -11,7 +11,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry.radial_homography import RadialHomography, inverses
 
 
-def spread_choice(points: FloatArray, most: int | None) -> IntArray:
+def grid_subsample(points: FloatArray, most: int | None) -> IntArray:
     """Indices of about ``most`` of the points (M, 2), ascending, evenly spread over their bounding box.
 
     The points are dealt out by the cells of a grid: first one of each cell, then the second of each, until there
@@ -68,7 +68,7 @@ class Link:
         """About ``most`` of the correspondences at the most, well spread over the overlap; the number stays."""
         if most is None or len(self.points1) <= most:
             return replace(self, count=len(self))
-        kept = spread_choice(self.points1, most)
+        kept = grid_subsample(self.points1, most)
         return replace(self, points1=self.points1[kept], points2=self.points2[kept], count=len(self))
 
 

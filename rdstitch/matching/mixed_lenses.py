@@ -52,15 +52,15 @@ def two_lenses(cameras: Sequence[Camera], votes: LensVotes) -> TwoLenses | None:
     if not divisions:
         return None
     second, lenses = min(
-        divisions, key=lambda division: votes.mahalanobis_residuals(division[1][votes.which(division[0])]).sum()
+        divisions, key=lambda division: votes.mahalanobis_residuals(division[1][votes.lens_index(division[0])]).sum()
     )
     seen = np.isin(np.arange(count), [votes.image1, votes.image2])
     if 2 * second[seen].sum() > seen.sum():
         second, lenses = ~second, lenses[::-1]
     second &= seen  # of an image without votes nothing is known that would tell it from most others
-    which = votes.which(second)
-    between = which[:, 0] != which[:, 1]
-    number, missed = int(between.sum()), votes.mahalanobis_residuals(lenses[which])
+    lens_index = votes.lens_index(second)
+    between = lens_index[:, 0] != lens_index[:, 1]
+    number, missed = int(between.sum()), votes.mahalanobis_residuals(lenses[lens_index])
     remaining = max(float(missed[between].sum()), max(_MAX_MEAN_RESIDUAL, float(missed.mean())) * number)
     if not number or by_one[between].sum() < (_MIN_GAIN + _GAIN_OF_FEW / number) * remaining:
         return None
@@ -102,16 +102,16 @@ def _divisions(count: int, votes: LensVotes) -> Iterator[tuple[BoolArray, FloatA
     for cut in np.argsort(levels[:-1] - levels[1:], kind="stable")[:_STARTS]:
         second, lenses = of_images > levels[cut], levels[[cut, cut + 1]]
         for _ in range(_ROUNDS):
-            lenses = votes.fitted(votes.which(second), lenses)
+            lenses = votes.fitted(votes.lens_index(second), lenses)
             second ^= _margins(count, votes, second, lenses) < 0.0
         yield second, lenses
 
 
 def _margins(count: int, votes: LensVotes, second: BoolArray, lenses: FloatArray) -> FloatArray:
     """By how much more the votes were missed if an image came from the other lens, for each image (N,)."""
-    which = votes.which(second)
-    missed = votes.mahalanobis_residuals(lenses[which])
+    lens_index = votes.lens_index(second)
+    missed = votes.mahalanobis_residuals(lenses[lens_index])
     total: FloatArray = np.zeros(count)
     for image, other in zip((votes.image1, votes.image2), np.eye(2, dtype=int), strict=True):
-        np.add.at(total, image, votes.mahalanobis_residuals(lenses[which ^ other]) - missed)
+        np.add.at(total, image, votes.mahalanobis_residuals(lenses[lens_index ^ other]) - missed)
     return total

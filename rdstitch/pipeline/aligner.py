@@ -20,7 +20,7 @@ from rdstitch.errors import ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
 from rdstitch.matching.candidate_pairs import loop_closures
-from rdstitch.matching.copies import SAME_PX, copies_of, distinct, near_copies_of
+from rdstitch.matching.copies import SAME_PX, copies_of, near_copies_of, without_copies
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
@@ -153,10 +153,10 @@ class Aligner:
         if not any(pair.relation for pair in pairs):
             raise RegistrationError(_no_overlap(self.paths, pairs))
         copies = copies_of(pairs)
-        related = distinct(pairs, copies)
+        related = without_copies(pairs, copies)
         if not related:  # all images show the same
             copies = {}
-            related = distinct(pairs, copies)
+            related = without_copies(pairs, copies)
         options = self._options_without(copies)
         near = without_measurements(near_copies_of(related), options)
         near = {copy: first for copy, first in near.items() if copy not in counted}

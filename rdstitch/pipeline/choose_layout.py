@@ -22,7 +22,7 @@ from rdstitch.choices import Purpose
 from rdstitch.compositing.seam_quality import DIAGONAL
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
-from rdstitch.matching.copies import copies_of, distinct
+from rdstitch.matching.copies import copies_of, without_copies
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.lay_out import (
@@ -201,7 +201,7 @@ def _error(registration: Registration) -> float:
     homography that fits all of them.
     """
     used, transfer = registration.alignment.used, registration.alignment.transfer
-    distinct_pairs = distinct(registration.pairs, copies_of(registration.pairs)).values()
+    distinct_pairs = without_copies(registration.pairs, copies_of(registration.pairs)).values()
     pairs = [pair for pair in distinct_pairs if used[pair.image1] and used[pair.image2]]
     some = [pairs[k] for k in evenly_spaced(len(pairs), _SAMPLED_PAIRS).tolist()]
     errors = np.concatenate([np.zeros(0), *(pair.errors(transfer)[pair.relation.inliers] for pair in some)])

@@ -16,7 +16,7 @@ from rdstitch.geometry.division_model import distort, undistort, valid_radius
 from rdstitch.geometry.exif_orientation import inverse, turned, turning_matrix
 from rdstitch.geometry.planar_motion import PlanarMotion, rotation_from_tilt, tilt_from_normal
 from rdstitch.geometry.radial_homography import inverses
-from rdstitch.matching.links import spread_choice
+from rdstitch.matching.links import grid_subsample
 
 coordinates = st.floats(-1.0, 1.0, allow_subnormal=False)
 distortions = st.floats(-0.95, 0.45)
@@ -159,7 +159,7 @@ def test_inverses_are_inverses(poses: np.ndarray, natural: np.ndarray) -> None:
 
 @given(arrays(float, st.tuples(st.integers(1, 60), st.just(2)), elements=_numbers(-1.0, 1.0)), st.integers(1, 40))
 def test_thinning_keeps_the_requested_number(points: np.ndarray, most: int) -> None:
-    kept = spread_choice(points, most)
+    kept = grid_subsample(points, most)
     assert len(kept) == min(most, len(points))
     assert (np.diff(kept) > 0).all()
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.matching.links import Link, spread_choice
+from rdstitch.matching.links import Link, grid_subsample
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, sigma_of
 
 _CHUNK = 4096  # correspondences linearized at a time: what stays in cache
@@ -141,5 +141,5 @@ class Observations:
         """Of each link at most about ``most`` correspondences, well spread over its overlap."""
         if self.most <= most:
             return self
-        kept = [spread_choice(self.points1[a:b], most) + a for a, b in itertools.pairwise(self.start)]
+        kept = [grid_subsample(self.points1[a:b], most) + a for a, b in itertools.pairwise(self.start)]
         return self.rows(np.concatenate([np.empty(0, dtype=np.intp), *kept]), np.array([len(k) for k in kept]))

@@ -15,12 +15,11 @@ from rdstitch.matching.candidate_pairs import loop_closures, prescreen_pairs
 from rdstitch.matching.feature_store import FeatureStore
 from rdstitch.matching.pair_estimator import FeatureMatching, PairEstimator
 from rdstitch.matching.static_background import (
-    has_static_background,
     is_static_pair,
     moving_features,
     without_static_background,
 )
-from rdstitch.matching.two_view import EstimationTask, PairRegistration
+from rdstitch.matching.two_view import EstimationTask
 from rdstitch.robust import EstimationOptions
 from rdstitch.system.progress import silent
 
@@ -78,21 +77,6 @@ def test_a_moving_board_is_found_before_a_static_background() -> None:
     assert all(pair.relation and not is_static_pair(pair, 3.0) for pair in moving[1])
     distortion = np.median([pair.relation.distortion for pair in moving[1]])
     assert abs(distortion - LENS.distortion) < 0.02
-
-
-def test_matches_of_a_pair_are_read_once_to_find_what_is_static(monkeypatch: pytest.MonkeyPatch) -> None:
-    estimator = _estimator(400, 150)
-    pairs, read, loaded = estimator.estimate(ALL), list[PairRegistration](), PairRegistration.correspondences
-
-    def noted(pair: PairRegistration) -> Correspondences:
-        read.append(pair)
-        return loaded.__get__(pair)  # type: ignore[no-any-return]
-
-    monkeypatch.setattr(PairRegistration, "correspondences", property(noted))
-    has_static_background(pairs, 3.0)
-    assert len(read) == len(pairs)
-    moving_features(estimator.features, pairs, 3.0)
-    assert len(read) == 2 * len(pairs)
 
 
 @pytest.mark.parametrize(("resting", "moving"), [(400, 0), (4, 300)])
