@@ -14,6 +14,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import from_directions, from_plane, to_directions, to_plane
 from rdstitch.local_alignment.field import DisplacementField
+from rdstitch.system.late_imports import csgraph, sparse
 
 # Share of the image's diagonal: matches farther off are taken to be wrong. Where the ground rises by a tenth of the
 # camera's height, and the alignment is that of the valleys, right ones are nearly as far off.
@@ -108,6 +109,22 @@ class PlacedMatches(Rows):
         order = np.argsort(self.images.ravel(), kind="stable")
         images, first = np.unique(self.images.ravel()[order], return_index=True)
         return tuple(zip(images.tolist(), np.split(order, first[1:]), strict=True))
+
+    @cached_property
+    def tracks(self) -> NDArray[np.intp]:
+        """Of each match (M,) the number of its track: all matches that keypoints lead to from one to the next.
+
+        The longest tracks come first; those of a length are as evenly spread over an image as its keypoints.
+        """
+        keypoint, count = np.empty(2 * len(self), dtype=np.intp), 0
+        for _, chosen in self.of_image:
+            found, each = np.unique(self.points.reshape(-1, 2)[chosen] @ (1.0, 1.0j), return_inverse=True)
+            keypoint[chosen] = count + each
+            count += len(found)
+        edges = sparse.coo_array((np.ones(len(self)), (keypoint[::2], keypoint[1::2])), (count, count))
+        track = csgraph.connected_components(edges, directed=False)[1][keypoint[::2]]
+        longest_first = np.argsort(-np.bincount(track), kind="stable")
+        return np.argsort(longest_first)[track]
 
     @cached_property
     def neighbours(self) -> NDArray[np.intp]:
