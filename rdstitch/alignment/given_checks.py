@@ -50,26 +50,37 @@ _SIGNED_ORDERS = tuple(
 """Matrices (2, 2) that change signs and order of (ψ, θ); the first changes nothing."""
 
 
-def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[AlignmentOptions, Message] | None:
-    """Options without what the images contradict, or with the scatter that they show; and what the user should know.
+def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[AlignmentOptions, list[Message]]:
+    """Options without what the images contradict, or with the scatter or delay that they show; and what changed.
 
-    None where nothing is given, or the images agree with it as well as it is said to be known, or show no tilts.
+    Nothing where nothing is given, or the images agree with it as well as it is said to be known, or show no tilts.
     """
     if options.attitudes is None and options.tilt is None:
-        return None
-    without = replace(options, attitudes=None, delayed_attitudes=None, tilt=None)
-    fitted = _fit_without_tilts(problem, options, without)
+        return options, []
+    fitted = _fit_without_tilts(problem, options)
     if fitted is None:
-        return None
-    priors = problem.camera_priors
-    shown = _ShownTilts.of(*fitted, free_mount=options.tilt is None)
-    if (
-        priors.delayed_attitudes is not None
-        and (late := shown.delay(priors.delayed_attitudes + priors.tilt)) is not None
-    ):
-        attitudes = at_delay(np.asarray(options.delayed_attitudes), late[0])
-        return replace(options, attitudes=attitudes, delayed_attitudes=None), attitudes_late(*late)
-    given, stated = priors.attitudes + priors.tilt, options.attitudes_std if options.attitudes is not None else 0.0
+        return options, []
+    priors, messages = problem.camera_priors, list[Message]()
+    shown, attitudes, delayed = _ShownTilts.of(*fitted, options), priors.attitudes, priors.delayed_attitudes
+    if delayed is not None and (late := shown.delay(delayed + priors.tilt)) is not None:
+        attitudes, of_all = (at_delay(np.asarray(values), late[0]) for values in (delayed, options.delayed_attitudes))
+        options = replace(options, attitudes=of_all, delayed_attitudes=None)
+        messages.append(attitudes_late(*late))
+    if (contradiction := _contradiction(shown, attitudes + priors.tilt, options)) is not None:
+        options, message = contradiction
+        messages.append(message)
+    return options, messages
+
+
+def _without_tilts(options: AlignmentOptions) -> AlignmentOptions:
+    return replace(options, attitudes=None, delayed_attitudes=None, tilt=None)
+
+
+def _contradiction(
+    shown: "_ShownTilts", given: FloatArray, options: AlignmentOptions
+) -> tuple[AlignmentOptions, Message] | None:
+    """What replaces the options where the images contradict the given tilts (N, 2), radians, or their accuracy."""
+    stated = options.attitudes_std if options.attitudes is not None else 0.0
     # The largest log likelihood and its scatter of tilts as given, with other signs or order, and of none.
     changed = [shown.best_scatter(given @ change.T) for change in _SIGNED_ORDERS]
     (as_given, scatter), likeliest = changed[0], max(range(len(changed)), key=lambda k: changed[k][0])
@@ -78,26 +89,24 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
         return None
     if max(as_changed, without_any) >= as_given + _LOG_ODDS:
         if options.attitudes is None:
-            return without, tilt_contradicted(given[0], np.median(shown.tilts, axis=0))
+            return _without_tilts(options), tilt_contradicted(given[0], np.median(shown.tilts, axis=0))
         change = _SIGNED_ORDERS[likeliest] if as_changed > without_any + _LOG_ODDS else None
-        return without, attitudes_contradicted(scatter, change, max(scatter_changed, _EXACT))
+        return _without_tilts(options), attitudes_contradicted(scatter, change, max(scatter_changed, _EXACT))
     if options.attitudes is None:
         return None
     return replace(options, attitudes_std=scatter), attitudes_scatter(scatter, stated)
 
 
-def _fit_without_tilts(
-    problem: Problem, options: AlignmentOptions, without: AlignmentOptions
-) -> tuple[Problem, Fit] | None:
+def _fit_without_tilts(problem: Problem, options: AlignmentOptions) -> tuple[Problem, Fit] | None:
     """The problem that knows nothing of the tilts, and a fit with the tilts that it shows; None where it shows none."""
     priors = problem.camera_priors
     nothing = replace(
         priors, attitudes=np.zeros_like(priors.attitudes), attitudes_std=None, tilt=(0.0, 0.0), tilt_known=False
     )
     bare = replace(problem, camera_priors=nothing)
-    models = [name for name in without.models if not MODELS[name].on_sphere]
+    models = [name for name in _without_tilts(options).models if not MODELS[name].on_sphere]
     # A model of one tilt shows no others.
-    models = models if without.model == "auto" or options.attitudes is None else _WITH_TILTS
+    models = models if options.model == "auto" or options.attitudes is None else _WITH_TILTS
     fit = select_model(bare, models).fit if models else None
     if fit is None or not fit.model.has_metric_poses:
         return None
@@ -152,8 +161,8 @@ class _ShownTilts:
     axes: FloatArray
 
     @classmethod
-    def of(cls, problem: Problem, fit: Fit, *, free_mount: bool) -> "_ShownTilts":
-        """By a planar fit that knows nothing of the tilts; with ``free_mount`` up to what all have in common."""
+    def of(cls, problem: Problem, fit: Fit, options: AlignmentOptions) -> "_ShownTilts":
+        """By a planar fit that knows nothing of the tilts; up to what all have in common where no tilt is given."""
         adjuster, adjusted, model = problem.adjuster_of(fit), fit.adjusted, fit.model
         normal = adjuster.normal_equations(adjusted)
         tilts = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)[:, [PSI, THETA]]
@@ -169,7 +178,7 @@ class _ShownTilts:
         by_shared[len(model.shared_names) - 1] = tilts[images].ravel()
         moved_poses, moved_shared = normal.responses(-by_pose, -by_shared)
         covariance = np.einsum("ndb,ndc->bc", by_pose, moved_poses, optimize=True) + by_shared.T @ moved_shared
-        if free_mount:
+        if options.tilt is None:
             covariance = covariance + _FREE_MOUNT**2 * np.tile(np.eye(2), (len(images), len(images)))
         variances, axes = np.linalg.eigh((covariance + covariance.T) / 2.0)
         return cls(images, tilts[images], np.maximum(variances, 0.0), axes)

@@ -90,9 +90,10 @@ def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
 
 def _lens_and_model(given: GivenImages) -> AdjustedImages:
     """The lens, the wrong pairs and the model, by as many matches of each link as show them."""
-    options, messages = given.options, list[Message]()
-    priors = options.camera_priors(given.cameras)
-    all_matches, relations = _observations(given.links, given.cameras, _matches_of_a_link(len(given.links), options))
+    priors = given.options.camera_priors(given.cameras)
+    all_matches, relations = _observations(
+        given.links, given.cameras, _matches_of_a_link(len(given.links), given.options)
+    )
     sample = all_matches.thinned(int(np.clip(_MATCHES_FOR_SELECTION // len(given.links), 40, 150)))
     lens = choose_observable_lens(given, sample, relations, priors)
     distortion = float(lens.pairwise.parameters.lens[0])
@@ -103,9 +104,8 @@ def _lens_and_model(given: GivenImages) -> AdjustedImages:
     # Data weigh against priors as they will in the final adjustment.
     shared, _ = independent_errors(connected.observations, connected.homographies, connected.lens)
     all_links, connected = (replace(one, overdispersion=shared) for one in (all_links, connected))
-    while (contradiction := check_attitudes(connected, options)) is not None:
-        options, message = contradiction
-        messages.append(message)
+    options, messages = check_attitudes(connected, given.options)
+    if messages:
         all_links = replace(all_links, camera_priors=options.camera_priors(given.cameras).with_lens(distortion))
         connected, _ = all_links.part(~wrong)
     choice = select_model(connected, options.models, lens.refinements, options.purpose)

@@ -21,7 +21,7 @@ from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatch
 _COARSE, _FINE = (12, 120_000), (24, 40_000)
 _SLOPES = (0.2, 0.06, 0.02)
 _SLOPE_OF_GROUND = 0.5  # one surface for all images: many matches determine it, and it may be freer
-_HELD_OUT = 5  # every fifth track
+_HELD_OUT = 5  # every fifth track: a keypoint brings its error to all its matches, fitted or not
 _WORTHWHILE = 0.15  # share by which what a person sees must get less for local alignment to be worth while
 # A person sees edges that do not go on across seams, as far as this percentile of the held-out residuals, and straight
 # edges, of a tenth of the diagonal or more, that fields bend up to this percentile: a single one is seen.
@@ -104,7 +104,6 @@ def align_locally(
     coarse, fine = (max(2, min(cells, math.isqrt(nodes // len(cameras)))) for cells, nodes in (_COARSE, _FINE))
     finest = max(coarse, math.isqrt(_COARSE[1] // len(cameras)))
     cells = max(coarse, fine) if choice == "auto" else min(choice, finest)
-    # All matches of a track: errors of a keypoint are in each of them, and fields could follow those that are left.
     held_out = placed.tracks % _HELD_OUT == _HELD_OUT - 1
     if not held_out.any():
         return no_local_alignment("there are too few tracks of matches")
@@ -125,7 +124,9 @@ def align_locally(
         costs = [cost + _bend(one.fields, straight()) for cost, one in zip(costs, candidates, strict=True)]
     best = candidates[int(np.argmin(costs))]
     before, after = HeldOut.of(tested.residual), HeldOut.of(best.residual)
-    text = f"matches that decided, held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} with"
+    text = (
+        f"matches that decided, held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} with"
+    )
     if min(costs) > limit:
         return LocalAlignment((), f"not worth while; {text}", before=before, after=after)
     if base is not None:

@@ -112,9 +112,9 @@ class PlacedMatches(Rows):
 
     @cached_property
     def tracks(self) -> NDArray[np.intp]:
-        """Of each match (M,) the number of its track: all matches that keypoints lead to from one to the next.
+        """For each match the number of its track: matches that share keypoints, and so their errors, have the same.
 
-        The longest tracks come first; those of a length are as evenly spread over an image as its keypoints.
+        The longest tracks, which wrong matches make of many, come first.
         """
         keypoint, count = np.empty(2 * len(self), dtype=np.intp), 0
         for _, chosen in self.of_image:
