@@ -88,7 +88,7 @@ def find_images(
     of videos and bags is used, or else those that show new ground, see :mod:`rdstitch.inputs.keyframes`. ``topic`` is
     that of the images in bags; without one, the only one.
     """
-    unwanted = {place_of(Path(path)) for path in exclude}
+    excluded = {place_of(Path(path)) for path in exclude}
     named = expanded(arguments)
     notes, stills = list(named.notes), [item for item in named.items if isinstance(item, NamedImage)]
     frames: list[Frame] = []
@@ -105,7 +105,7 @@ def find_images(
         for image in images:
             path = image.frame.path
             is_output = image.frame.image is None and not is_url(path) and is_rdstitch_output(path)
-            if is_output and place_of(path) in unwanted:
+            if is_output and place_of(path) in excluded:
                 continue
             if is_output and not image.named:
                 outputs.append(path)

@@ -115,17 +115,17 @@ def csv_rows(
     """
     if "\0" in text:
         raise InputError(f"{file}: is not UTF-8 text; save it as CSV in UTF-8")
-    known = _finder(file, columns, units)
+    column_of = _column_finder(file, columns, units)
     lines = list(io.StringIO(text, newline=None))
-    start = next((n for n, line in enumerate(lines) if _is_heading(line, known)), 0)
+    start = next((n for n, line in enumerate(lines) if _is_heading(line, column_of)), 0)
     heading = lines[start].lstrip("# ") if lines else ""
     # Comments become empty lines, so that the others keep their numbers.
     rest = ("" if line.startswith("#") else line for line in lines[start + 1 :])
     reader = csv.reader([heading, *rest], delimiter=_delimiter(heading), skipinitialspace=True, strict=True)
     try:
         headings = next(reader, [])
-        meanings = set(map(known, headings))
-        if not any({known(name) or name for name in names.split(",")} <= meanings for names in wanted):
+        present = set(map(column_of, headings))
+        if not any({column_of(name) or name for name in names.split(",")} <= present for names in wanted):
             raise InputError(f"{file}: its first line names no columns like {' or '.join(wanted)}")
         rows = []
         for fields in reader:
@@ -138,7 +138,7 @@ def csv_rows(
         raise InputError(f"{file}: line {reader.line_num + start}: is not CSV: {error}") from error
     if not rows:
         raise InputError(f"{file}: has no rows below its heading")
-    return rows_of(rows, known)
+    return rows_of(rows, column_of)
 
 
 def is_table(
@@ -152,11 +152,11 @@ def is_table(
 
     ``is_listed`` tells a line of the list, which may hold decimal commas.
     """
-    known = _finder(file, columns, units)
-    heading = next((line for line in text.splitlines() if _is_heading(line, known)), "")
+    column_of = _column_finder(file, columns, units)
+    heading = next((line for line in text.splitlines() if _is_heading(line, column_of)), "")
     first = next((line for _, line in numbered_lines(text, file)), "")
     delimiter = _delimiter(heading)
-    return _names_columns(heading, known) and delimiter in first and (delimiter == "\t" or not is_listed(first))
+    return _names_columns(heading, column_of) and delimiter in first and (delimiter == "\t" or not is_listed(first))
 
 
 def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> list[Row]:
@@ -165,7 +165,7 @@ def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> 
     if not isinstance(content, list) or not all(isinstance(item, dict) for item in content):
         raise InputError(f"{file}: expected {wanted}")
     rows = ((f"{file}: [{number}]", item.items()) for number, item in enumerate(content))
-    return rows_of(rows, _finder(file, columns, _NO_UNITS))
+    return rows_of(rows, _column_finder(file, columns, _NO_UNITS))
 
 
 def numbered_lines(text: str, file: str) -> list[tuple[str, str]]:
@@ -220,7 +220,7 @@ def _readings(text: str) -> dict[str, float]:
     return numbers
 
 
-def _finder(file: str, columns: Mapping[str, str], units: Mapping[str, str]) -> Callable[[str], str | None]:
+def _column_finder(file: str, columns: Mapping[str, str], units: Mapping[str, str]) -> Callable[[str], str | None]:
     """Which column a heading means."""
     meaning = {alias: column for column, aliases in columns.items() for alias in aliases.split()}
 
@@ -244,13 +244,13 @@ def _finder(file: str, columns: Mapping[str, str], units: Mapping[str, str]) -> 
     return find
 
 
-def _is_heading(line: str, known: Callable[[str], str | None]) -> bool:
+def _is_heading(line: str, column_of: Callable[[str], str | None]) -> bool:
     """Check whether a line is the heading: the first one that is no comment, or a comment that names columns."""
-    return _names_columns(line, known) if line.startswith("#") else bool(line.strip())
+    return _names_columns(line, column_of) if line.startswith("#") else bool(line.strip())
 
 
-def _names_columns(line: str, known: Callable[[str], str | None]) -> bool:
-    return sum(known(field) is not None for field in re.split(f"[{_DELIMITERS}]", line.lstrip("# "))) > 1
+def _names_columns(line: str, column_of: Callable[[str], str | None]) -> bool:
+    return sum(column_of(field) is not None for field in re.split(f"[{_DELIMITERS}]", line.lstrip("# "))) > 1
 
 
 def _delimiter(heading: str) -> str:

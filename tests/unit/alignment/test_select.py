@@ -7,7 +7,7 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from examples.worlds.alignment_scenes import aligned, fitted, grid, grid_scene, scene
+from examples.worlds.alignment_scenes import aligned, fitted, grid, grid_scene, scene, turn_links
 from examples.worlds.turns import camera_rotations
 from rdstitch.alignment import Alignment, AlignmentOptions, align
 from rdstitch.alignment.adjustment_problem import Fit, Problem
@@ -162,6 +162,27 @@ def test_of_two_images_a_turn_is_taken_where_a_homography_is_hardly_more_probabl
         for model, score, errors in ((ROTATION, turn, field), (RIGID, 80.0, 4.0), (HOMOGRAPHY, 0.0, 0.2))
     ]
     assert _best(posterior, tried).fit.model.name == chosen
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("purpose", [Purpose.MOSAIC, Purpose.CALIBRATE])
+def test_two_images_of_a_turn_with_few_matches_are_a_turn(seed: int, purpose: Purpose) -> None:
+    """A homography fits them better, by no more than its parameters cost."""
+    rotations = camera_rotations(np.radians([0.0, 15.0]), [0.1, 0.1])
+    links = turn_links(Camera(SIZE, -0.05, focal=FOCAL), rotations, np.random.default_rng(seed), 0.5, 60)
+    cameras = [Camera(SIZE, focal=FOCAL, focal_source="guess")] * 2
+    assert align(cameras, links, AlignmentOptions(purpose=purpose)).model == "rotation"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_plane_is_no_turn_of_a_camera_with_an_endless_focal_length(seed: int) -> None:
+    """Short steps without a turn: rays of a long lens move as much, by two parameters less; a tilt has four more."""
+    given = grid_scene(
+        3, 1, (0.08, 0.08), 0.0, seed=seed, lens=Camera(SIZE, -0.05), focal=480.0, focal_source="guess", noise=1.0,
+        outliers=0.0, per_link=40,
+    )  # fmt: skip
+    found = aligned(given)
+    assert found.model == "rigid"
 
 
 def test_a_model_that_was_requested_is_taken() -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from examples.worlds.alignment_scenes import grid_scene
 from examples.worlds.correspondences import correspondences
 from examples.worlds.turns import panorama_rotations
 from rdstitch.choices import SOLVERS, SolverName
@@ -172,3 +173,27 @@ def test_two_points_find_turns_that_a_thirteenth_of_the_matches_shows(known: boo
         result = estimate_radial_homography(first[order], second[order], (1000, 800), distortion=lens)
         found += bool(result.inliers[order < right].mean() > 0.6)
     assert found >= 5
+
+
+@pytest.mark.parametrize(
+    ("model", "seed", "distortion", "noise", "step"),
+    [
+        ("rigid", 3, 0.0, 2.0, 0.3),
+        ("similarity", 9, 0.0, 1.0, 0.05),
+        ("similarity", 9, -0.05, 1.0, 0.05),
+        ("similarity", 9, -0.05, 2.0, 0.3),
+    ],
+)
+def test_a_model_that_needs_an_unusual_lens_is_not_taken(
+    model: str, seed: int, distortion: float, noise: float, step: float
+) -> None:
+    """Of few matches that hardly show λ, another model explains a little more, with λ off by .05 to .2."""
+    change = 0.2 if model == "similarity" else 0.0
+    lens = Camera((640, 480), distortion)
+    given = grid_scene(
+        2, 1, (step, step), 0.1, wind=(change, 0.0), seed=seed, lens=lens, noise=noise, focal=480.0, per_link=40,
+        outliers=0.1,
+    )  # fmt: skip
+    (link,) = given.links
+    found = estimate_radial_homography(link.points1, link.points2, lens.image_size, focal=480.0, focal_source="guess")
+    assert found.model == model
