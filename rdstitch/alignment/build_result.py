@@ -54,7 +54,6 @@ class AdjustedImages:
     problem: Problem  # of those aligned, with the matches that they were adjusted by
     choice: ModelChoice
     lens: LensChoice  # the lens, with the distortion centre if the motion model freed it
-    positions_disagree: str = ""  # why the positions were not used; empty where they were, or where there are none
     leverage: Mapping[int | str, float] = field(default_factory=dict)  # see Alignment
     messages: tuple[Message, ...] = ()  # on what was given
     # covariance, lens_covariance: of what was estimated, and of all parameters of a lens; none of a draft
@@ -283,6 +282,4 @@ def _messages(adjusted: AdjustedImages, camera: Camera) -> tuple[Message, ...]:
             result.append(focal_overruled(ratio))
     if not fit.adjusted.converged:
         result.append(not_converged(purpose))
-    if adjusted.positions_disagree:
-        result.append(Message(adjusted.positions_disagree))
     return (*result, *adjusted.messages)

@@ -19,8 +19,10 @@ from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster
 from rdstitch.alignment.least_squares.plane_marks import ControlPoints, PlaneMarks
 from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.motion_models import X, Y
+from rdstitch.alignment.sentences import map_contradicted
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.geometry.places import MILLIMETRE
+from rdstitch.results.messages import Message
 from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 from rdstitch.robust.posterior import MODEL_ERROR
 from rdstitch.robust.similarity_fit import OUTLYING, SimilarityFit, fit_similarity
@@ -49,7 +51,7 @@ class MapFit:
 
     problem: Problem
     fit: Fit
-    disagreement: str = ""
+    disagreement: Message | None = None
     leverage: Mapping[int | str, float] = field(default_factory=dict)  # by image of the problem, and name of a point
 
     def leverage_of(self, images: IntArray) -> dict[int | str, float]:
@@ -63,10 +65,10 @@ def adjust_to_map(problem: Problem, fit: Fit) -> MapFit:
         return MapFit(problem, fit)
     kinds: list[_KnownPlaces] = [_Control(problem, fit), _Positions(problem)]
     known = [places for places in kinds if places.enough]
-    disagreement = ""
+    disagreement = None
     while known:
         with_map = _adjusted(problem, fit, known)
-        if not with_map.disagreement:
+        if with_map.disagreement is None:
             return replace(with_map, disagreement=disagreement)
         disagreement, known = disagreement or with_map.disagreement, known[1:]
     return MapFit(problem, fit, disagreement)
@@ -207,19 +209,12 @@ def _adjusted(problem: Problem, fit: Fit, known: list[_KnownPlaces]) -> MapFit:
         if max(moved) < _SETTLED:
             break
     growth = math.hypot(refined.adjusted.sigma, MODEL_ERROR) / math.hypot(fit.adjusted.sigma, MODEL_ERROR)
-    if contradiction := _contradiction(known[0], on_map[0][0], growth):
-        text = f"the {known[0].name} contradict the images ({contradiction}) and were not used for the alignment"
-        return MapFit(problem, fit, text)
+    distance = float(np.median(on_map[0][0].residuals))
+    far = isinstance(known[0], _Positions) and distance > OUTLYING * max(float(np.median(known[0].std)), POSITION_STD)
+    if far or growth > _MAX_GROWTH:
+        return MapFit(problem, fit, map_contradicted(known[0].name, distance if far else None, growth))
     fixed = replace(with_map, camera_priors=replace(with_map.camera_priors, fix_frame=True))
-    return MapFit(fixed, refined, "", _leverage(with_map, refined, known))
-
-
-def _contradiction(places: _KnownPlaces, similarity: SimilarityFit, growth: float) -> str:
-    """How known places contradict the images, whose errors grow so many times with them; empty where they do not."""
-    distance = float(np.median(similarity.residuals))
-    if isinstance(places, _Positions) and distance > OUTLYING * max(float(np.median(places.std)), POSITION_STD):
-        return f"half of them are {distance:.0f} m or more from where the images were taken"
-    return "" if growth <= _MAX_GROWTH else f"with them the errors of the matches grow by {growth - 1.0:.0%}"
+    return MapFit(fixed, refined, None, _leverage(with_map, refined, known))
 
 
 def _leverage(problem: Problem, fit: Fit, known: Sequence[_KnownPlaces]) -> dict[int | str, float]:

@@ -11,6 +11,7 @@ from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, F
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.motion_models import PSI, THETA
 from rdstitch.alignment.result import Alignment, PlanarPoses
+from rdstitch.alignment.uncertainty import pose_jacobian
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.posterior import exact
@@ -65,11 +66,15 @@ def with_near_copies(
     matrices = adjusted.matrices.matrices
     frame = alignment.homographies[alignment.reference] @ matrices[reference]
     result.homographies[rows] = frame @ inverses(matrices[copies])
-    if result.poses is not None:  # how well a copy is known is how well its image is
+    if result.poses is not None:
         metric = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)
         placed = PlanarPoses.of(metric).relative_to(reference)
         for name in ("yaw", "position", "height", "tilt"):
             getattr(result.poses, name)[rows] = getattr(placed, name)[copies]
+        if result.poses.covariance is not None:  # a copy is as uncertain as its image, and as where it lies beside that
+            own = adjuster.normal_equations(adjusted).pose_covariances()[0][copies]
+            moved = pose_jacobian(model, adjusted.parameters.poses, start.shared, reference)[copies, :, : own.shape[1]]
+            result.poses.covariance[rows] += moved @ own @ moved.swapaxes(1, 2)
     return result
 
 

@@ -170,7 +170,7 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
         problem=problem,
         choice=replace(choice, fit=fit),
         lens=chosen.lens.refined(fit.free_lens),
-        positions_disagree=on_map.disagreement,
+        messages=(*filter(None, [on_map.disagreement]), *chosen.messages),
         leverage=on_map.leverage_of(chosen.images),
         covariance=covariance,
         lens_covariance=of_lens,

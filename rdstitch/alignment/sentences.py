@@ -58,6 +58,14 @@ def attitudes_contradicted(scatter: float, change: FloatArray | None, scatter_ch
     return Message(text, code="attitudes-contradicted")
 
 
+def map_contradicted(places: str, distance: float | None, growth: float) -> Message:
+    """Of places on the map, by name, with which errors grow so many times, or half of which are so many metres off."""
+    why = f"with them the errors of the matches grow by {growth - 1.0:.0%}"
+    if distance is not None:
+        why = f"half of them are {distance:.0f} m or more from where the images were taken"
+    return Message(f"the {places} contradict the images ({why}) and were not used for the alignment")
+
+
 def relief_explained(left: Coherence, model: MotionModel, links: int) -> str:
     """What the agreement of neighbours that a model leaves means for the scene."""
     found = shows_relief(left)

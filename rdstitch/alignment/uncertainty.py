@@ -258,7 +258,8 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
             [np.concatenate([poses, by_shared], axis=2), np.concatenate([other.swapaxes(1, 2), shared], axis=2)], axis=1
         )
 
-    jacobian = _jacobian(model, parameters.poses, parameters.shared, problem.reference, size + len(of_shared))
+    jacobian = pose_jacobian(model, parameters.poses, parameters.shared, problem.reference)
+    jacobian = np.pad(jacobian, ((0, 0), (0, 0), (0, size + len(of_shared) - jacobian.shape[2])))  # by the lens
     relief = _relief(adjuster, fit.adjusted)
     # A lens that was held, although the images show more of it, has moved the poses by the step to the freed one.
     steps_of_poses, steps_of_shared = (
@@ -271,12 +272,12 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
     return of_images + moved @ moved.transpose(0, 2, 1), with_first + moved @ moved[0].T
 
 
-def _jacobian(model: MotionModel, poses: FloatArray, shared: FloatArray, reference: int, size: int) -> FloatArray:
+def pose_jacobian(model: MotionModel, poses: FloatArray, shared: FloatArray, reference: int) -> FloatArray:
     """Derivatives (N, 4, D + S) of x, y, height and yaw in the frame of the reference."""
     yaw, height = poses[reference, YAW], float(np.exp(poses[reference, LOG_HEIGHT]))
     unit = 1.0 / (height * model.focal(shared))
     turn = unit * np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    jacobian = np.zeros((len(poses), 4, size))
+    jacobian = np.zeros((len(poses), 4, model.pose_size + len(shared)))
     for place, column in enumerate(model.free):
         if column in (X, Y):
             jacobian[:, :2, place] = turn[:, column - X]

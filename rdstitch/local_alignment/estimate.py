@@ -104,7 +104,9 @@ def align_locally(
     coarse, fine = (max(2, min(cells, math.isqrt(nodes // len(cameras)))) for cells, nodes in (_COARSE, _FINE))
     finest = max(coarse, math.isqrt(_COARSE[1] // len(cameras)))
     cells = max(coarse, fine) if choice == "auto" else min(choice, finest)
-    held_out = placed.tracks % _HELD_OUT == 0
+    held_out = placed.tracks % _HELD_OUT == _HELD_OUT - 1
+    if not held_out.any():
+        return no_local_alignment("there are too few tracks of matches")
     fitted, tested = placed.take(~held_out), placed.take(held_out)
     worthwhile = (1.0 - _WORTHWHILE) * _seam_residual(tested.residual)
     limit = worthwhile if choice == "auto" else math.inf
@@ -122,7 +124,9 @@ def align_locally(
         costs = [cost + _bend(one.fields, straight()) for cost, one in zip(costs, candidates, strict=True)]
     best = candidates[int(np.argmin(costs))]
     before, after = HeldOut.of(tested.residual), HeldOut.of(best.residual)
-    text = f"matches held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} pixels with it"
+    text = (
+        f"matches that decided, held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} with"
+    )
     if min(costs) > limit:
         return LocalAlignment((), f"not worth while; {text}", before=before, after=after)
     if base is not None:

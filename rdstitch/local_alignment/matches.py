@@ -8,14 +8,13 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from rdstitch.arrays import FloatArray, Rows
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import from_directions, from_plane, to_directions, to_plane
 from rdstitch.local_alignment.field import DisplacementField
+from rdstitch.system.late_imports import csgraph, sparse
 
 # Share of the image's diagonal: matches farther off are taken to be wrong. Where the ground rises by a tenth of the
 # camera's height, and the alignment is that of the valleys, right ones are nearly as far off.
@@ -113,11 +112,19 @@ class PlacedMatches(Rows):
 
     @cached_property
     def tracks(self) -> NDArray[np.intp]:
-        """For each match the number of its track: matches that share keypoints, and so their errors, have the same."""
-        keypoints = np.column_stack([self.images.ravel(), self.points.reshape(-1, 2)])
-        nodes = np.unique(keypoints, axis=0, return_inverse=True)[1].reshape(-1, 2)
-        links = coo_array((np.ones(len(nodes)), (nodes[:, 0], nodes[:, 1])), shape=(2 * len(nodes), 2 * len(nodes)))
-        return np.asarray(connected_components(links, directed=False)[1][nodes[:, 0]], dtype=np.intp)
+        """For each match the number of its track: matches that share keypoints, and so their errors, have the same.
+
+        The longest tracks, which wrong matches make of many, come first.
+        """
+        keypoint, count = np.empty(2 * len(self), dtype=np.intp), 0
+        for _, chosen in self.of_image:
+            found, each = np.unique(self.points.reshape(-1, 2)[chosen] @ (1.0, 1.0j), return_inverse=True)
+            keypoint[chosen] = count + each
+            count += len(found)
+        edges = sparse.coo_array((np.ones(len(self)), (keypoint[::2], keypoint[1::2])), (count, count))
+        track = csgraph.connected_components(edges, directed=False)[1][keypoint[::2]]
+        longest_first = np.argsort(-np.bincount(track), kind="stable")
+        return np.argsort(longest_first)[track]
 
     @cached_property
     def neighbours(self) -> NDArray[np.intp]:

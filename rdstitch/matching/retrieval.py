@@ -6,7 +6,9 @@ a tree of two levels (Nistér and Stewénius 2006). Two images are alike as far 
 their square, of which 10,000 images take seconds.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -102,8 +104,7 @@ def similarity(features: FeatureStore, seed: int) -> Similarity | None:
     starts = np.cumsum(counts) - counts
     parts = np.split(chosen, np.searchsorted(chosen, starts[1:]))
     vocabulary = Vocabulary.learned(_training(features, parts, starts), branches, random)
-    described = (_describing(of_image) for of_image in features)
-    words = np.concatenate([vocabulary.assign(of_image) for of_image in described])
+    words = np.concatenate([*map(vocabulary.assign, _in_blocks(map(_describing, features)))])
     shape = len(counts), vocabulary.size
     used = sparse.csr_array((np.ones(total, dtype=np.float32), words, np.append(starts, total)), shape)
     used.sum_duplicates()
@@ -132,6 +133,12 @@ def _describing(features: Features) -> Array32:
     """The descriptors that stand for an image."""
     descriptors = features.descriptors[:_FEATURES_PER_IMAGE]
     return (np.unpackbits(descriptors.astype(np.uint8), axis=1) if features.binary else descriptors).astype(np.float32)
+
+
+def _in_blocks(of_images: Iterator[Array32]) -> Iterator[Array32]:
+    """The descriptors of several images at once: few of each image are near the same words."""
+    while images := list(islice(of_images, _BLOCK // _FEATURES_PER_IMAGE)):
+        yield np.concatenate([one for one in images if len(one)] or images[:1])
 
 
 def _compare(weights: "sparse.csr_array") -> Similarity:

@@ -30,13 +30,7 @@ from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.options.upright_options import Corners
 from rdstitch.pipeline.map_canvas import place_on_canvas, plan_on_map
-from rdstitch.pipeline.run import Run
-from rdstitch.results.messages import Message
-from rdstitch.results.placed_images import PlacedImages
-from rdstitch.results.stitch_result import OutputImage
-from rdstitch.system.outputs import Outputs, text_bytes
-from rdstitch.system.process_memory import return_freed_memory
-from rdstitch.verification.output_messages import (
+from rdstitch.pipeline.output_messages import (
     cut_away_messages,
     differing_profile_messages,
     lost_profile_messages,
@@ -44,6 +38,12 @@ from rdstitch.verification.output_messages import (
     place_messages,
     seam_messages,
 )
+from rdstitch.pipeline.run import Run
+from rdstitch.results.messages import Message
+from rdstitch.results.placed_images import PlacedImages
+from rdstitch.results.stitch_result import OutputImage
+from rdstitch.system.outputs import Outputs, text_bytes
+from rdstitch.system.process_memory import return_freed_memory
 
 
 @dataclass(frozen=True)

@@ -44,9 +44,9 @@ class ResultEvidence:
         return [fit for fit in self.alignment.links if fit.used]
 
     @property
-    def worst(self) -> LinkFit:
-        """The link with the largest errors."""
-        return max(self.used, key=lambda fit: fit.rms)
+    def worst(self) -> LinkFit | None:
+        """The link with the largest errors; None where none is used."""
+        return max(self.used, key=lambda fit: fit.rms, default=None)
 
     @cached_property
     def _images(self) -> ComparedImages:

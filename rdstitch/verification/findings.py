@@ -54,7 +54,7 @@ class Kind(Enum):
         "something unique"
     )
     PATTERN = Scope.WHOLE, "", "{count} of {of} pairs fit as well elsewhere (a repeated pattern?)"
-    LOOKED_AT = Scope.WHOLE, "", (
+    OVERLAPS_SAMPLED = Scope.WHOLE, "", (
         "of {of} overlaps {count} were compared in their pixels, {sampled} of them at random: at most {share:.1%} of "
         "all are wrong, with a confidence of 95%"
     )

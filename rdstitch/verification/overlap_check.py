@@ -107,7 +107,7 @@ def check_overlaps(registration: Registration, images: ComparedImages, cache: Ca
         if alignment.poses is None or alignment.on_sphere:
             # On a plane that is not metric a period of a pattern is another shift at every place.
             return checked
-        return _by_what_is_unique(images, alignment, checked)
+        return _resolve_by_departures(images, alignment, checked)
 
     inputs = (described, chosen, registration.stretch, alignment.on_sphere, alignment.poses is None)
     return cache.recall("overlaps", inputs, compute)
@@ -124,7 +124,7 @@ def wrong_at_most(checked: Sequence[CheckedLink]) -> float:
     return float((middle + z * np.sqrt(wrong * (count - wrong) / count + z**2 / 4.0)) / (count + z**2))
 
 
-def _by_what_is_unique(
+def _resolve_by_departures(
     images: ComparedImages, alignment: Alignment, checked: Sequence[CheckedLink]
 ) -> list[CheckedLink]:
     """The same links; those that are ambiguous but for something unique are known to be."""

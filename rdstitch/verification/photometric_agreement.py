@@ -46,8 +46,9 @@ class Agreement:
 
     cells: int  # cells with texture in both images
     confirming: int  # cells that correlate best, and well, where the registration says
-    in_all: int = 0  # cells with texture in the whole of the second image
-    coarsely: float = math.nan  # share of the overlap that looks alike three times smaller; NaN where it is too small
+    textured_cells: int = 0  # cells with texture in the whole of the second image
+    # share of the overlap that looks alike three times smaller; NaN where it is too small
+    coarse_similarity: float = math.nan
 
     @property
     def share(self) -> float:
@@ -57,7 +58,7 @@ class Agreement:
     @property
     def unlike_cells(self) -> float:
         """Number of the cells that look different three times smaller, where depth and blur are no difference."""
-        return 0.0 if math.isnan(self.coarsely) else self.cells * (1.0 - self.coarsely)
+        return 0.0 if math.isnan(self.coarse_similarity) else self.cells * (1.0 - self.coarse_similarity)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Kind
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.overlap_check import wrong_at_most
-from rdstitch.verification.second_motions import fills_at_most
+from rdstitch.verification.second_motions import max_plane_fraction
 
 
 def _disagreeing_pairs(evidence: ResultEvidence) -> Iterator[Finding]:
@@ -82,6 +82,7 @@ def _errors(evidence: ResultEvidence) -> Iterator[Finding]:
     """Errors of all pairs together; of a picture its seams say whether they are seen."""
     alignment, threshold = evidence.alignment, evidence.threshold
     rms, relief = alignment.rms, alignment.relief
+    worst = evidence.worst
     if rms <= Limits.max_rms * threshold:
         return
     largest = Limits.max_relief_rms * 2.0 * max(camera.scale for camera in alignment.cameras)
@@ -92,22 +93,22 @@ def _errors(evidence: ResultEvidence) -> Iterator[Finding]:
         relief.found and explained and evidence.alike_fraction >= Limits.min_clearly_alike_fraction
     )
     values = {"rms": rms, "threshold": threshold}
-    if rough or evidence.purpose.picture:
+    if worst is not None and (rough or evidence.purpose.picture):
         severity = _warning_if(evidence.flat or _depth_seen(evidence))
-        yield Finding(Kind.ROUGH, evidence.worst.images, severity, values)
-    else:
+        yield Finding(Kind.ROUGH, worst.images, severity, values)
+    elif not evidence.purpose.picture:
         yield Finding(Kind.ERRORS, values=values)
 
 
 def _depth(evidence: ResultEvidence) -> Iterator[Finding]:
     """Errors that neighbouring matches have in common, and where they are largest."""
-    relief = evidence.alignment.relief
-    if relief.found:
-        fit, kind = evidence.worst, (Kind.DEPTH_OF_A_TURN if evidence.alignment.on_sphere else Kind.RELIEF)
+    relief, worst = evidence.alignment.relief, evidence.worst
+    if relief.found and worst is not None:
+        kind = Kind.DEPTH_OF_A_TURN if evidence.alignment.on_sphere else Kind.RELIEF
         # Even where seams hold a bent plane adds up from image to image, and tilts take most of it up.
         bent = not evidence.purpose.picture or relief.size > Limits.max_shared_error * evidence.threshold
         severity = _warning_if((evidence.flat and bent) or _depth_seen(evidence))
-        yield Finding(kind, fit.images, severity, {"what": relief.explanation, "rms": fit.rms})
+        yield Finding(kind, worst.images, severity, {"what": relief.explanation, "rms": worst.rms})
 
 
 def _depth_seen(evidence: ResultEvidence) -> bool:
@@ -121,9 +122,9 @@ def _warning_if(warns: bool) -> Severity:
 
 def _free_homographies(evidence: ResultEvidence) -> Iterator[Finding]:
     """A homography for each of three or more images: their chain bends with whatever is not modelled."""
-    alignment = evidence.alignment
-    if evidence.flat and alignment.focal is None:
-        yield Finding(Kind.FREE_HOMOGRAPHIES, evidence.worst.images, _warning_if(alignment.relief.found))
+    alignment, worst = evidence.alignment, evidence.worst
+    if worst is not None and evidence.flat and alignment.focal is None:
+        yield Finding(Kind.FREE_HOMOGRAPHIES, worst.images, _warning_if(alignment.relief.found))
 
 
 def _unlike(evidence: ResultEvidence) -> Iterator[Finding]:
@@ -131,12 +132,8 @@ def _unlike(evidence: ResultEvidence) -> Iterator[Finding]:
     as depth shifts what it shows by a little nearly everywhere.
     """
     for link in evidence.checked:
-        coarsely = evidence.purpose.picture and link.agreement.coarsely >= Limits.min_plane_fraction
-        if (
-            link.agreement.cells >= Limits.min_cells
-            and link.agreement.share < Limits.max_unlike_fraction
-            and not coarsely
-        ):
+        alike = evidence.purpose.picture and link.agreement.coarse_similarity >= Limits.min_plane_fraction
+        if link.agreement.cells >= Limits.min_cells and link.agreement.share < Limits.max_unlike_fraction and not alike:
             values = {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
             yield Finding(Kind.UNLIKE, link.pair, "failure", values)
 
@@ -147,7 +144,7 @@ def _compared_overlaps(evidence: ResultEvidence) -> Iterator[Finding]:
     if share < Limits.max_wrong_overlaps:
         sampled = sum(link.sampled for link in checked)
         values = {"of": len(evidence.used), "count": len(checked), "sampled": sampled, "share": share}
-        yield Finding(Kind.LOOKED_AT, (), "detail", values)
+        yield Finding(Kind.OVERLAPS_SAMPLED, (), "detail", values)
 
 
 def _ambiguous(evidence: ResultEvidence) -> Iterator[Finding]:
@@ -166,7 +163,7 @@ def _pattern(evidence: ResultEvidence) -> Iterator[Finding]:
 
 def _rival_motion(evidence: ResultEvidence) -> Iterator[Finding]:
     """Poses by something that fills less than half of the images: what drives ahead, say."""
-    share = fills_at_most(link.agreement for link in evidence.checked)
+    share = max_plane_fraction(link.agreement for link in evidence.checked)
     if share < Limits.min_plane_fraction:
         yield Finding(Kind.RIVAL_MOTION, values={"share": share})
 

@@ -37,7 +37,7 @@ def planes_of_pairs(registration: Registration, threshold: float, threads: int =
 
     def fills(pair: Pair, motion: RadialHomography) -> tuple[float, RadialHomography]:
         first = images.placed(pair[0], motion.camera, motion.homography)
-        return fills_at_most([overlap_agreement(first, images.placed(pair[1], motion.camera2, np.eye(3)))]), motion
+        return max_plane_fraction([overlap_agreement(first, images.placed(pair[1], motion.camera2, np.eye(3)))]), motion
 
     def filled_by(motions: Mapping[Pair, RadialHomography]) -> dict[Pair, tuple[float, RadialHomography]]:
         with ThreadPoolExecutor(threads) as pool:
@@ -49,7 +49,7 @@ def planes_of_pairs(registration: Registration, threshold: float, threads: int =
         return None
     for pair, filled in filled_by(second_motions(registration.alignment.cameras, pairs, threshold)).items():
         found[pair] = max(found[pair], filled, key=lambda each: each[0])
-    needed = _least_needed({pair: share for pair, (share, _) in found.items() if share >= half})
+    needed = bottleneck_fraction({pair: share for pair, (share, _) in found.items() if share >= half})
     return [
         replace(pair, relation=found[pair.images][1] if found[pair.images][0] >= needed else _no_plane(pair))
         if pair.images in found
@@ -58,7 +58,7 @@ def planes_of_pairs(registration: Registration, threshold: float, threads: int =
     ]
 
 
-def _least_needed(fills: Mapping[Pair, float]) -> float:
+def bottleneck_fraction(fills: Mapping[Pair, float]) -> float:
     """The share from which on pairs join all images that all of them join: those of less may show anything."""
     if not fills:
         return math.inf
@@ -92,10 +92,10 @@ def second_motions(
     return result
 
 
-def fills_at_most(compared: Iterable[Agreement]) -> float:
+def max_plane_fraction(compared: Iterable[Agreement]) -> float:
     """Share of the images of some pairs that is not seen to contradict a motion, in [0, 1]."""
     agreements = list(compared)
-    return 1.0 - sum(each.unlike_cells for each in agreements) / max(sum(each.in_all for each in agreements), 1)
+    return 1.0 - sum(each.unlike_cells for each in agreements) / max(sum(each.textured_cells for each in agreements), 1)
 
 
 def _no_plane(pair: PairRegistration) -> RadialHomography:

@@ -34,7 +34,7 @@ class RefusedError(RegistrationError):
         chosen = list(first.values())[:_MAX_WARNINGS]
         reasons = "; ".join(message.clause for message in chosen)
         if rest := len(registration.failures) - len(chosen):
-            reasons += f"; and {rest} more like {'these' if len(chosen) > 1 else 'this'}"
+            reasons += f"; and {rest} more"
         super().__init__(f"no reliable result: {reasons} (--force writes it all the same)")
         self.registration = registration
 

@@ -121,7 +121,7 @@ def test_the_largest_displacement_is_told(frames: list[Path]) -> None:
     told = report_page(result).split("<h2>Local alignment</h2>")[1].split("</section>")[0]
     farthest = max(field.largest for field in result.local_alignment.fields)
     assert f"by up to {farthest:.1f} pixels" in told
-    assert "matches held out of the fit" in told
+    assert "matches that decided, held out of the fit" in told
     off = report_page(pano(frames[:2], options=replace(options, local_alignment="off")))
     assert "the alignment puts them: switched off" in off
 

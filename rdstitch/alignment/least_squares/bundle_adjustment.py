@@ -49,7 +49,7 @@ class Parameters:
     def retract(
         self, model: MotionModel, step_poses: FloatArray, step_shared: FloatArray, free_lens: BoolArray
     ) -> Self:
-        """After a step."""
+        """The parameters after a step."""
         lens = self.lens.copy()
         size = len(self.shared)
         lens[free_lens] += step_shared[size:]
@@ -90,7 +90,7 @@ class BundleAdjustmentResult:
 
     @cached_property
     def homographies(self) -> FloatArray:
-        """Of each link, (L, 3, 3)."""
+        """Homographies (L, 3, 3) of the links."""
         return self.adjuster.of_links(self.matrices)
 
     @cached_property
@@ -115,7 +115,7 @@ class BundleAdjustmentResult:
 
     @property
     def equations(self) -> LinkEquations:
-        """At the solution."""
+        """Errors of the links, linearized at the solution."""
         return self.adjuster.linearized(self.parameters, ALIGNMENT_WIDTH * self.sigma).equations
 
     @cached_property

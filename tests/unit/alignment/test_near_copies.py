@@ -11,8 +11,9 @@ from examples.worlds.turns import camera_rotations
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, align
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.alignment.least_squares.plane_marks import Sighting
-from rdstitch.alignment.motion_models import PSI, THETA, X
+from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X
 from rdstitch.alignment.near_copies import without_measurements
+from rdstitch.alignment.result import PlanarPoses
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.links import Link
 
@@ -69,6 +70,26 @@ def test_a_near_copy_lies_where_it_was_taken(model: str, attitudes_std: float | 
     np.testing.assert_allclose(found.poses.tilt[6:], given.poses[6:, [PSI, THETA]], atol=np.radians(0.1))
     apart = np.linalg.norm(found.poses.position[6:] - found.poses.position[4], axis=1)
     np.testing.assert_allclose(apart, [0.0, 0.015 / np.exp(given.poses[alone.reference, 3])], atol=0.002)
+
+
+def test_covariances_of_near_copies_are_what_they_scatter_by() -> None:
+    """Of the reference, which is known exactly, so that all that is stated is of the copies themselves."""
+    ratios = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        poses = grid(3, 2, (0.4, 0.3), 0.2, rng)
+        poses = np.vstack([poses, poses[4], poses[4]])
+        poses[6:, [X, YAW, LOG_HEIGHT]] += rng.normal(scale=(0.02, 0.02, 0.01), size=(2, 3))
+        given = scene(poses, rng=rng, per_link=60, noise=0.4)
+        options = AlignmentOptions(reference=4, model="similarity", lens="division", pose_covariance=True)
+        found, true = _task(given.cameras, given.links, options).result.poses, PlanarPoses.of(poses).relative_to(4)
+        assert found is not None
+        assert found.covariance is not None
+        off = np.column_stack([found.position - true.position, found.height - true.height, found.yaw - true.yaw])
+        ratios.append(off[6:] ** 2 / np.einsum("nii->ni", found.covariance[6:]))
+    mean = np.concatenate(ratios).mean(axis=0)
+    assert (mean > 0.2).all()
+    assert (mean < 2.0).all()
 
 
 def test_near_copies_do_not_turn_the_level_frame() -> None:

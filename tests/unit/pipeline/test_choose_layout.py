@@ -21,12 +21,12 @@ from rdstitch.pipeline.aligner import Aligner
 from rdstitch.pipeline.choose_layout import _alternatives, _differs, _error, _Trials, choose_layout
 from rdstitch.pipeline.compose import CanvasPlan
 from rdstitch.pipeline.lay_out import is_stretched
+from rdstitch.pipeline.output_messages import seam_messages
 from rdstitch.pipeline.realign import aligner_of, by_second_motions
 from rdstitch.pipeline.recipes import mosaic, pano
 from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.registration import Registration
 from rdstitch.synthetic.textures import ground
-from rdstitch.verification.output_messages import seam_messages
 from tests.registrations import CAMERA, registered, registration, source
 
 

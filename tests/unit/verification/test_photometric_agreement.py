@@ -75,7 +75,7 @@ def test_what_has_no_texture_says_nothing() -> None:
 def test_cells_lie_inside_the_overlap() -> None:
     whole = overlap_agreement(_placed(100, 100), _placed(100, 100))
     # Cells of 24 pixels, with eight around them: 15 by 11.
-    assert 120 < whole.cells <= whole.in_all <= 16 * 12
+    assert 120 < whole.cells <= whole.textured_cells <= 16 * 12
     none = overlap_agreement(_placed(0, 0), _placed(500, 400))
     assert none.cells == 0
     half = overlap_agreement(_placed(100, 100), _placed(300, 100))

@@ -114,7 +114,7 @@ def test_every_kind_has_a_sentence_that_its_rules_find_all_words_for() -> None:
 
 
 @pytest.mark.parametrize(
-    ("purpose", "coarsely", "severity"),
+    ("purpose", "coarse", "severity"),
     [
         (Purpose.TRAJECTORY, 0.35, ["failure"]),
         (Purpose.TRAJECTORY, 0.45, []),
@@ -124,10 +124,10 @@ def test_every_kind_has_a_sentence_that_its_rules_find_all_words_for() -> None:
     ],
 )
 def test_poses_by_what_fills_less_than_half_of_the_images_are_none(
-    purpose: Purpose, coarsely: float, severity: list[str]
+    purpose: Purpose, coarse: float, severity: list[str]
 ) -> None:
     """A truck that drives ahead, say: four fifths of the images lie over each other, and most of that is unlike."""
-    link = replace(_checked(0.1, (0, 1), unique=False), agreement=Agreement(80, 8, 100, coarsely))
+    link = replace(_checked(0.1, (0, 1), unique=False), agreement=Agreement(80, 8, 100, coarse))
     found = rules.found(rules.OF_THE_WHOLE, evidence(registration(), purpose, checked=[link]))
     assert [finding.severity for finding in found if finding.kind is Kind.RIVAL_MOTION] == severity
 
@@ -157,12 +157,19 @@ def test_matches_of_a_picture_may_disagree_where_it_is_more_alike_than_by_chance
     assert bool(failures_of_matches(found)) is not placed
 
 
+def _found(given: ResultEvidence, *kinds: Kind) -> list[Finding]:
+    """Findings of some kinds, of images whose pixels say nothing unless they are given."""
+    vars(given).setdefault("checked", [])
+    every = rules.found((*rules.OF_MATCHES, *rules.OF_PAIRS, *rules.OF_THE_WHOLE), given)
+    return [finding for finding in every if finding.kind in kinds]
+
+
 def _misfits(count: int, *, agree: float = 0.2, keypoints: tuple[int, ...] = (900, 900, 900)) -> list[Message]:
     """What is said of two images with so many matches, of which a share agrees with the alignment."""
     fit = LinkFit(0, 1, count, int(agree * count), 0.5, True)
     given = registration(2, keypoints=keypoints, links=(fit,))
     found = evidence(given)
-    return messages_of([*rules._disagreeing_pairs(found), *rules._misfitting_images(found)], given)
+    return messages_of(_found(found, Kind.PAIR_MISFITS, Kind.IMAGE_MISFITS), given)
 
 
 @pytest.mark.parametrize(
@@ -191,13 +198,14 @@ def test_images_of_whose_matches_two_fifths_disagree_are_named() -> None:
 @pytest.mark.parametrize("inliers", [20, 55, 65])
 def test_a_copy_is_judged_by_its_own_matches(inliers: int) -> None:
     links = LinkFit(0, 1, 100, 90, 0.5, True), LinkFit(0, 2, 100, inliers, 0.5, False, Unused.COPY)
-    found = [*rules._misfitting_images(evidence(registration(3, links=links, keypoints=(900,) * 3)))]
+    found = _found(evidence(registration(3, links=links, keypoints=(900,) * 3)), Kind.IMAGE_MISFITS)
     assert [finding.images for finding in found] == [(2,)] * (inliers < 60)
 
 
 def _texts(*sources: Source) -> list[str]:
     given = registration(sources)
-    return [message.text for message in messages_of(rules._inputs(evidence(given)), given)]
+    found = _found(evidence(given), Kind.SEVERAL_CAMERAS, Kind.ZOOMED, Kind.UNMASKED)
+    return [message.text for message in messages_of(found, given)]
 
 
 @pytest.mark.parametrize("other", [{"model": "B"}, {"model": "B", "serial": "1"}, {"make": "X", "model": "A"}])
@@ -261,8 +269,15 @@ def test_images_without_a_mask_among_others_are_named() -> None:
 def test_free_homographies_are_doubted_where_neighbours_errors_agree(relief: bool, severity: str) -> None:
     ground = replace(FLAT.alignment.relief, found=relief)
     found = evidence(registration(parameters=(), relief=ground))
-    assert [(own.kind, own.severity) for own in rules._free_homographies(found)] == [(Kind.FREE_HOMOGRAPHIES, severity)]
-    assert not list(rules._free_homographies(evidence(registration(2, parameters=(), relief=ground))))
+    assert [finding.severity for finding in _found(found, Kind.FREE_HOMOGRAPHIES)] == [severity]
+    assert not _found(evidence(registration(2, parameters=(), relief=ground)), Kind.FREE_HOMOGRAPHIES)
+
+
+def test_where_no_pair_is_used_nothing_is_said_of_the_worst() -> None:
+    """Of images that are all copies of one, say."""
+    ground = replace(FLAT.alignment.relief, found=True)
+    found = evidence(registration(links=(), parameters=(), relief=ground, rms=np.nan), Purpose.MOSAIC)
+    assert not _found(found, Kind.FREE_HOMOGRAPHIES, Kind.ROUGH, Kind.ERRORS, Kind.RELIEF)
 
 
 LARGEST = 0.02 * 500.0  # pixels that relief explains, of images with a diagonal of 500
@@ -290,7 +305,7 @@ def test_errors_of_the_whole(rms: float, alike: float, relief: float | None, kin
     ground = replace(registration().alignment.relief, found=relief is not None, size=relief or 0.0)
     cameras = (CAMERA, Camera((40, 30)), CAMERA)
     found = evidence(registration(rms=rms, relief=ground, cameras=cameras), alike_fraction=alike)
-    findings = list(rules._errors(found))
+    findings = _found(found, Kind.ERRORS, Kind.ROUGH)
     assert [finding.kind for finding in findings] == ([] if kind is None else [kind])
     for finding in findings:
         assert finding.severity == ("warning" if kind == Kind.ROUGH else "failure")
@@ -304,13 +319,13 @@ def _checked(share: float, pair: tuple[int, int], *, unique: bool) -> CheckedLin
 
 def test_of_pairs_that_unique_places_decided_the_least_alike_is_named() -> None:
     seen = [_checked(share, (k, k + 1), unique=k < 2) for k, share in enumerate((0.5, 0.3, 0.1))]
-    (finding,) = rules._pattern(evidence(registration(4), ambiguous={}, checked=seen))
+    (finding,) = _found(evidence(registration(4), checked=seen), Kind.PATTERN, Kind.SETTLED_PATTERN)
     assert (finding.kind, finding.images) == (Kind.SETTLED_PATTERN, (1, 2))
 
 
 @pytest.mark.parametrize("certain", [True, False])
 def test_images_of_two_lenses_that_were_not_separated(certain: bool) -> None:
     mixed = TwoLenses(np.array([False, True, False]), (-0.1, -0.4), certain)
-    findings = list(rules._mixed_lenses(evidence(registration(mixed=mixed))))
+    findings = _found(evidence(registration(mixed=mixed)), Kind.LENSES_MIXED)
     values = {"images2": [1], "images1": [0, 2], "lens2": -0.4, "lens1": -0.1}
     assert [finding.values for finding in findings] == ([] if certain else [values])

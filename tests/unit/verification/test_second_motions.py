@@ -20,7 +20,7 @@ from rdstitch.synthetic.textures import ground
 from rdstitch.verification import second_motions
 from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.photometric_agreement import Agreement, ComparedImage, Grey, overlap_agreement
-from rdstitch.verification.second_motions import _least_needed, fills_at_most, planes_of_pairs
+from rdstitch.verification.second_motions import bottleneck_fraction, max_plane_fraction, planes_of_pairs
 from tests.registrations import registration, source
 
 SIZE = (400, 300)
@@ -136,13 +136,13 @@ def test_where_all_pairs_show_a_plane_there_is_nothing_to_choose(monkeypatch: py
 
 def test_what_is_not_seen_speaks_against_nothing() -> None:
     cells = Agreement(10, 0, 40, 0.4)
-    assert fills_at_most([cells]) == pytest.approx(1.0 - 6 / 40)
-    assert fills_at_most([cells, cells]) == fills_at_most([cells])
-    assert fills_at_most([Agreement(10, 0, 40)]) == fills_at_most([]) == 1.0
+    assert max_plane_fraction([cells]) == pytest.approx(1.0 - 6 / 40)
+    assert max_plane_fraction([cells, cells]) == max_plane_fraction([cells])
+    assert max_plane_fraction([Agreement(10, 0, 40)]) == max_plane_fraction([]) == 1.0
 
 
 def test_pairs_that_are_less_sure_than_those_that_hold_the_images_together_are_not_needed() -> None:
     fills = {(0, 1): 0.9, (1, 2): 0.8, (0, 2): 0.51, (2, 3): 0.7, (0, 3): 0.6, (7, 8): 0.75}
-    assert _least_needed(fills) == 0.7
-    assert _least_needed({(0, 1): 0.6}) == 0.6
-    assert _least_needed({}) == np.inf
+    assert bottleneck_fraction(fills) == 0.7
+    assert bottleneck_fraction({(0, 1): 0.6}) == 0.6
+    assert bottleneck_fraction({}) == np.inf

@@ -1,14 +1,21 @@
 """Whether images could agree at other places too, and what is unique in them."""
 
 import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from rdstitch.alignment.result import LinkFit
 from rdstitch.geometry.camera import Camera
+from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.source import Source
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import DecodedImage
 from rdstitch.synthetic.textures import ground
+from rdstitch.verification import overlap_check
 from rdstitch.verification.photometric_agreement import ComparedImage
 from rdstitch.verification.self_similarity import (
     Ambiguity,
@@ -18,7 +25,8 @@ from rdstitch.verification.self_similarity import (
     find_ambiguity,
     placement_ambiguity,
 )
-from rdstitch.verification.unique_places import departures, unique_shifts
+from rdstitch.verification.unique_places import UniqueShift, departures, unique_shifts
+from tests.registrations import registration
 
 SIZE = (256, 192)
 LENS = Camera(SIZE)
@@ -147,6 +155,39 @@ def test_stains_say_by_how_many_periods_an_image_is_off(periods: tuple[int, int]
     assert found.shift * LENS.scale == pytest.approx([-put[0], -put[1]], abs=1.0)
     assert found.share > 0.9
     assert found.matched_elsewhere < found.matched / 3.0
+
+
+def test_few_images_of_a_pattern_are_held_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three images, of which two may be held: pair by pair the stains are found as well."""
+    placed = [_image(TWO, left, top, seed=k) for k, (left, top) in enumerate([(150, 100), (213, 128), (110, 120)])]
+    frames = [
+        Frame(Path(f"{k}.png"), image=DecodedImage(np.rint(255.0 * each.grey).astype(np.uint8), None, Metadata(SIZE)))
+        for k, each in enumerate(placed)
+    ]
+    links = tuple(LinkFit(i, j, 100, 90, 0.5, True) for i, j in ((0, 1), (1, 2), (0, 2)))
+    given = registration(
+        [Source(frame.path, Metadata(SIZE), LENS, frame=frame) for frame in frames],
+        cameras=(LENS,) * 3,
+        homographies=np.stack([each.homography for each in placed]),
+        links=links,
+    )
+    held: list[int] = []
+
+    def counted(placed: Mapping[int, ComparedImage], *others: Any) -> dict[tuple[int, int], UniqueShift]:
+        held.append(len(placed))
+        return unique_shifts(placed, *others)
+
+    def unique() -> list[bool]:
+        checked = overlap_check.check_overlaps(given, overlap_check.ComparedImages(given.sources, given.stretch))
+        assert all(link.ambiguity.ambiguous for link in checked)
+        return [link.unique for link in checked]
+
+    monkeypatch.setattr(overlap_check, "unique_shifts", counted)
+    at_once = unique()
+    monkeypatch.setattr(overlap_check, "IMAGES_AT_ONCE", 2)
+    assert unique() == at_once
+    assert held == [3, 2, 2, 2]
+    assert sum(at_once) > 1
 
 
 def test_one_stain_is_enough_none_or_one_in_one_image_is_not_and_dust_on_the_lens_is_no_evidence() -> None:

@@ -1,9 +1,7 @@
 """The verdict on registered images, and what parallax tells it."""
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +19,7 @@ from rdstitch.pipeline.recipes import pano
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.synthetic import Photometry
-from rdstitch.verification import overlap_check, verdict
+from rdstitch.verification import verdict
 from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Kind, messages_of
 from rdstitch.verification.overlap_check import CheckedLink
@@ -58,19 +56,9 @@ def _moved(good: Registration, image: int, shift: float) -> Registration:
     return replace(good, alignment=replace(good.alignment, homographies=homographies))
 
 
-def test_few_images_of_a_pattern_are_held_at_once(good: Registration, monkeypatch: pytest.MonkeyPatch) -> None:
-    held: list[int] = []
-
-    def shifts(placed: Mapping[int, object], pairs: Sequence[tuple[int, int]], workers: int = 1) -> dict[Any, Any]:
-        held.append(len(placed))
-        return dict.fromkeys(pairs, SimpleNamespace(shift=(0.0, 0.0)))
-
-    monkeypatch.setattr(overlap_check, "IMAGES_AT_ONCE", 2, raising=False)
-    monkeypatch.setattr(overlap_check, "find_ambiguity", lambda *_: SimpleNamespace(ambiguous=True))
-    monkeypatch.setattr(overlap_check, "unique_shifts", shifts)
-    images = overlap_check.ComparedImages(good.sources, good.stretch)
-    checked = overlap_check.check_overlaps(good, images)
-    assert (max(held), [link.unique for link in checked]) == (2, [True] * len(checked))
+def test_what_was_not_named_is_counted(good: Registration) -> None:
+    failures = [Message(f"reason {k}", severity="failure", kind=str(k)) for k in range(5)]
+    assert "reason 0; reason 1; reason 2; and 2 more (" in str(verdict.RefusedError(good.with_messages(failures)))
 
 
 @pytest.mark.parametrize("shift", [0.03, 0.05])
@@ -157,11 +145,11 @@ def test_a_tenth_of_an_overlap_must_look_alike(cells: int, confirming: int, seve
     assert all(f"({confirming} of {cells}" in message.text for message in found)
 
 
-@pytest.mark.parametrize(("coarsely", "picture", "poses"), [(0.8, 0, 1), (0.4, 1, 1)])
-def test_depth_shifts_what_a_picture_shows_by_a_little(coarsely: float, picture: int, poses: int) -> None:
+@pytest.mark.parametrize(("coarse", "picture", "poses"), [(0.8, 0, 1), (0.4, 1, 1)])
+def test_depth_shifts_what_a_picture_shows_by_a_little(coarse: float, picture: int, poses: int) -> None:
     """Few cells agree to 2.5 pixels then, but most at a coarse scale."""
     checked = _checked(100, 6)
-    checked = replace(checked, agreement=replace(checked.agreement, coarsely=coarsely))
+    checked = replace(checked, agreement=replace(checked.agreement, coarse_similarity=coarse))
     said = [len(_judged(checked, purpose=purpose)) for purpose in (Purpose.MOSAIC, Purpose.TRAJECTORY)]
     assert said == [picture, poses]
 
