@@ -38,10 +38,17 @@ class Fit:
 
     model: MotionModel
     adjusted: BundleAdjustmentResult
-    free_lens: BoolArray  # (5,): lens parameters that were estimated
     tilt_spread: float | None = None  # standard deviation of the images' own tilts, radians; None without such
-    # of the errors that it leaves, at least that of the problem; see BundleAdjuster
-    overdispersion: float = 1.0
+
+    @property
+    def free_lens(self) -> BoolArray:
+        """Lens parameters that were estimated, (5,)."""
+        return self.adjusted.adjuster.free.lens
+
+    @property
+    def overdispersion(self) -> float:
+        """Of the errors that it leaves, at least that of the problem; see :class:`BundleAdjuster`."""
+        return self.adjusted.adjuster.overdispersion
 
     @property
     def bare(self) -> Self:
@@ -132,7 +139,7 @@ class Problem(LinkProblem):
             scales, changed = self._rescaled(scales, adjusted, rounds)
             if not changed:
                 own_tilts = scales.tilt_spread if model.free_tilts else None
-                return Fit(model, adjusted, self.free_lens, own_tilts, scales.overdispersion)
+                return Fit(model, adjusted, own_tilts)
             at = adjusted.parameters
         raise AssertionError("scales settle")
 

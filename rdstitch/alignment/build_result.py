@@ -254,14 +254,14 @@ def _link_fits(adjusted: AdjustedImages) -> tuple[LinkFit, ...]:
         row = rows.get(frozenset((link.image1, link.image2)))
         if row is None or not kept:
             why = Unused.ELSEWHERE if kept else Unused.CONTRADICTS
-            result.append(LinkFit(link.image1, link.image2, len(link), 0, math.nan, False, why))
+            result.append(LinkFit(link.image1, link.image2, len(link), 0, math.nan, why))
             continue
         rows_of_link = slice(observations.start[row], observations.start[row + 1])
         agreeing = adjusted.agreeing[rows_of_link]
         good = adjusted.squared[rows_of_link][agreeing]
         inliers = round(len(good) / max(len(agreeing), 1) * len(link))
         rms = float(np.sqrt(good.mean())) if len(good) else float(medians[row])
-        result.append(LinkFit(link.image1, link.image2, len(link), inliers, rms, True))
+        result.append(LinkFit(link.image1, link.image2, len(link), inliers, rms))
     return tuple(result)
 
 
@@ -269,8 +269,8 @@ def _messages(adjusted: AdjustedImages, camera: Camera) -> tuple[Message, ...]:
     """What the user should know of the whole."""
     result, lens, known = list[Message](), adjusted.lens, adjusted.problem.camera_priors
     purpose, fit = adjusted.given.options.purpose, adjusted.fit
-    if lens.depth or not lens.observable:
-        result.append(lens_not_observable(purpose, depth=lens.depth))
+    if not lens.observable:
+        result.append(lens_not_observable(purpose, lens.evidence))
     elif (count := len(adjusted.images)) < ENOUGH_IMAGES and adjusted.problem.free_lens.any():
         every = replace(camera, lens_covariance=tuple(map(tuple, adjusted.considered_lens_covariance.tolist())))
         off = _CONFIDENT * float(radius_std(every, _RADII)[-1])

@@ -169,7 +169,7 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
         chosen,
         problem=problem,
         choice=replace(choice, fit=fit),
-        lens=chosen.lens.refined(fit.free_lens),
+        lens=chosen.lens.refined(problem.free_lens),
         messages=(*filter(None, [on_map.disagreement]), *chosen.messages),
         leverage=on_map.leverage_of(chosen.images),
         covariance=covariance,

@@ -36,8 +36,12 @@ class LinkFit:
     count: int  # correspondences given
     inliers: int  # correspondences that agree with the alignment
     rms: float  # root mean square error of those, pixels; NaN where the link was not used
-    used: bool
     reason: Unused = Unused.NO  # why the link was not used
+
+    @property
+    def used(self) -> bool:
+        """Whether the alignment was adjusted to the link."""
+        return self.reason is Unused.NO
 
     @property
     def images(self) -> tuple[int, int]:
@@ -105,7 +109,7 @@ class Alignment:
         level frame, whatever their third coordinate.
     used : ndarray of shape (N,), bool
     components : tuple of tuple of int
-        The groups of images that overlap, largest first; the first is the aligned one.
+        The groups of images that overlap: the aligned one, then those with the most images that are no copies.
     reference : int
         The image that defines the plane's frame.
     model : str

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from rdstitch.alignment.lens.lens_selection import LensEvidence
 from rdstitch.alignment.motion_models import MotionModel
 from rdstitch.alignment.noise import COHERENT_CORRELATION, Coherence, shows_relief
 from rdstitch.alignment.result import Alignment, Unused
@@ -82,12 +83,13 @@ def relief_explained(left: Coherence, model: MotionModel, links: int) -> str:
     return f"errors of neighbours hardly agree (correlation {left.correlation:.2f}): {seen}"
 
 
-def lens_not_observable(purpose: Purpose, *, depth: bool) -> Message:
+def lens_not_observable(purpose: Purpose, evidence: LensEvidence) -> Message:
     """That λ is not known, because of depth or of too little motion.
 
     An image can be right whatever the lens is, and a path by what is known of the lens.
     """
     cause, remedy = "the images hardly move, or only turn about the optical axis", "images that overlap by less"
+    depth = evidence is LensEvidence.DEPTH
     if depth:
         cause, remedy = "what the images show has depth, which looks like a lens in so few of them", "more images"
     text = f"λ is not observable: {cause}; give λ, a camera file, or {remedy}"
@@ -127,7 +129,7 @@ def explain_unaligned(
     """
     contradicting: dict[int, list[int]] = {}
     for fit in alignment.links:
-        if not fit.used and fit.reason is Unused.CONTRADICTS:
+        if fit.reason is Unused.CONTRADICTS:
             contradicting.setdefault(fit.image1, []).append(fit.image2)
             contradicting.setdefault(fit.image2, []).append(fit.image1)
     blocks = [group for group in alignment.components if len(group) > 1]

@@ -215,7 +215,9 @@ def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:
         return fit
     fixed = replace(problem, free_lens=np.zeros_like(problem.free_lens))
     lens = np.where(problem.free_lens, weighed, parameters.lens)
-    return replace(fit, adjusted=fixed.refine(fit.model, replace(parameters, lens=lens), fit.tilt_spread).adjusted)
+    adjusted = fixed.refine(fit.model, replace(parameters, lens=lens), fit.tilt_spread).adjusted
+    # λ was held at a weighed value to adjust the rest; it is estimated all the same.
+    return replace(fit, adjusted=replace(adjusted, adjuster=problem.adjuster_of(fit)))
 
 
 def lever_std(problem: Problem, fit: Fit) -> float:

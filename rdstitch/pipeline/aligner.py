@@ -74,6 +74,25 @@ class AlignedPairs:
 
 
 @dataclass(frozen=True)
+class _DistinctPairs:
+    """Registered pairs of images where each that is there twice counts once."""
+
+    registered: Mapping[Pair, PairRegistration]  # by the images that they are between, copies replaced
+    copies: Mapping[int, int]  # of each copy, the image that it is a copy of
+    near_copies: Mapping[int, int]  # of each that is placed afterwards, the image that shows almost the same
+
+    @property
+    def evidence(self) -> list[Pair]:
+        """The pairs that the images are aligned by."""
+        return [ends for ends in self.registered if not self.near_copies.keys() & {*ends}]
+
+    @property
+    def of_near_copies(self) -> list[Pair]:
+        """The pairs that near copies are placed by."""
+        return [ends for ends in self.registered if self.near_copies.keys() & {*ends}]
+
+
+@dataclass(frozen=True)
 class Aligner:
     """What the alignment of a set of images needs besides their pairs."""
 
@@ -152,48 +171,57 @@ class Aligner:
         """The images aligned; near copies are placed afterwards, but for those that are ``counted`` as all are."""
         if not any(pair.relation for pair in pairs):
             raise RegistrationError(_no_overlap(self.paths, pairs))
-        copies = copies_of(pairs)
-        related = without_copies(pairs, copies)
-        if not related:  # all images show the same
-            copies = {}
-            related = without_copies(pairs, copies)
-        options = self._options_without(copies)
-        near = without_measurements(near_copies_of(related), options)
-        near = {copy: first for copy, first in near.items() if copy not in counted}
-        evidence = [ends for ends in related if not near.keys() & {*ends}]
-        if not evidence:
-            near, evidence = {}, [*related]
-        ends = [*evidence, *(ends for ends in related if near.keys() & {*ends})]
-        most, stored = most_matches_read(len(evidence), self.options), self._quarters.back
-        cameras = tuple(stored.camera(camera, k) for k, camera in enumerate(self.cameras))
-        named = (replace(related[i, j].link().thinned(most), image1=i, image2=j) for i, j in ends)
-        links = tuple(stored.link(link, self.cameras) for link in named)
-        if (size := common_size(cameras, links)) is not None:
-            cameras = tuple(framed_camera(camera, size) for camera in cameras)
-            links = tuple(framed_link(link, size) for link in links)
-        task = AlignmentTask(cameras, links[: len(evidence)], options, near, links[len(evidence) :])
-        compared, twice = [related[pair].images for pair in evidence], copies | near
+        distinct = self._distinct(pairs, counted)
+        task, compared = self._task(distinct), [distinct.registered[ends].images for ends in distinct.evidence]
 
         def complete(stage: str, compute: Callable[[], Alignment]) -> Alignment:
             alignment = self._recalled(stage, task, compute)
-            alignment = alignment.with_copies(copies, compared)
+            alignment = alignment.with_copies(distinct.copies, compared)
             alignment = replace(alignment, links=(*alignment.links, *self._links_of_copies(alignment, pairs)))
+            twice = {*distinct.copies, *distinct.near_copies}
             return alignment.with_messages([self._counted_once(twice)] if twice else [])
 
         draft = complete("draft", lambda: task.draft)
-        if misfits := self._misfits(draft, related, near):
+        if misfits := self._misfits(draft, distinct):
             with_them = self._drafted(pairs, counted | misfits)
             if with_them.alignment.model != draft.model:  # so little new ground tells of motion, but not of the lens
                 return with_them
         return AlignedPairs(tuple(pairs), draft, completed=lambda: complete("alignment", lambda: task.result))
 
-    def _misfits(
-        self, alignment: Alignment, related: Mapping[Pair, PairRegistration], near: Mapping[int, int]
-    ) -> frozenset[int]:
+    def _distinct(self, pairs: Sequence[PairRegistration], counted: frozenset[int]) -> _DistinctPairs:
+        """Which pairs are evidence; where all images show the same, all are."""
+        copies = copies_of(pairs)
+        registered = without_copies(pairs, copies)
+        if not registered:
+            copies = {}
+            registered = without_copies(pairs, copies)
+        near = without_measurements(near_copies_of(registered), self._options_without(copies))
+        near = {copy: first for copy, first in near.items() if copy not in counted}
+        distinct = _DistinctPairs(registered, copies, near)
+        return distinct if distinct.evidence else replace(distinct, near_copies={})
+
+    def _task(self, distinct: _DistinctPairs) -> AlignmentTask:
+        """What is aligned: images as they are stored, cut ones in a frame that holds each of them."""
+        stored, count = self._quarters.back, len(distinct.evidence)
+        cameras = tuple(stored.camera(camera, k) for k, camera in enumerate(self.cameras))
+        most = most_matches_read(count, self.options)
+        named = (
+            replace(distinct.registered[i, j].link().thinned(most), image1=i, image2=j)
+            for i, j in (*distinct.evidence, *distinct.of_near_copies)
+        )
+        links = tuple(stored.link(link, self.cameras) for link in named)
+        if (size := common_size(cameras, links)) is not None:
+            cameras = tuple(framed_camera(camera, size) for camera in cameras)
+            links = tuple(framed_link(link, size) for link in links)
+        options = self._options_without(distinct.copies)
+        return AlignmentTask(cameras, links[:count], options, distinct.near_copies, links[count:])
+
+    def _misfits(self, alignment: Alignment, distinct: _DistinctPairs) -> frozenset[int]:
         """The near copies that a model fits worse than their images, and than their pairs fit on their own."""
         errors: dict[int, list[FloatArray]] = {}
+        near = distinct.near_copies
         concerned = near.keys() | {*near.values()}
-        for ends, pair in related.items():
+        for ends, pair in distinct.registered.items():
             copies = near.keys() & {*ends}
             if concerned & {*ends} and len(copies) < 2 and alignment.used[[*ends]].all():
                 both = np.array([pair.errors(alignment.transfer), pair.own_errors])[:, pair.relation.inliers]
@@ -237,7 +265,7 @@ class Aligner:
                 errors = pair.errors(alignment.transfer)[pair.relation.inliers]
                 good = errors[errors < max(self.threshold, SAME_PX)]
                 rms = float(np.sqrt(np.mean(good**2))) if len(good) else math.nan
-                yield LinkFit(*pair.images, len(errors), len(good), rms, used=False, reason=Unused.COPY)
+                yield LinkFit(*pair.images, len(errors), len(good), rms, Unused.COPY)
 
     def _counted_once(self, twice: Iterable[int]) -> Message:
         names = shortened(names_of(self.paths[k] for k in sorted(twice)))

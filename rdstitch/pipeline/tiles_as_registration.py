@@ -83,7 +83,7 @@ def _pair(
     blocks = links.blocks.take(of_pair)
     matches = Correspondences(indices, blocks.points1, blocks.points2, np.zeros(len(of_pair)))
     reason = Unused.NO if used else Unused.CONTRADICTS
-    fit = LinkFit(first, second, len(errors), int(agreeing.sum()), rms if used else math.nan, used, reason)
+    fit = LinkFit(first, second, len(errors), int(agreeing.sum()), rms if used else math.nan, reason)
     return PairRegistration(first, second, StoredMatches.of(matches), relation), fit
 
 

@@ -7,6 +7,7 @@ What a richer lens gains there is no irregular motion that it takes the blame fo
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 from typing import Self
 
 import numpy as np
@@ -43,6 +44,14 @@ _ENOUGH_LINKS = 2000
 lenses takes memory and time for each of them."""
 
 
+class LensEvidence(Enum):
+    """What the images show of λ."""
+
+    SUFFICIENT = auto()  # it is observable, or given
+    LITTLE_MOTION = auto()
+    DEPTH = auto()  # few images, of something with depth, which looks like a lens
+
+
 @dataclass(frozen=True, eq=False)
 class LensChoice:
     """The lens chosen."""
@@ -54,8 +63,12 @@ class LensChoice:
     # what may still be freed, where the motion model shows it: a distortion centre that is off the middle looks like
     # motion that is less regular. That μ is needed only pairs can say: it could stand for relief
     refinements: tuple[BoolArray, ...] = ()
-    observable: bool = True  # whether λ is observable, or known
-    depth: bool = False  # whether it is not because what few images show has depth
+    evidence: LensEvidence = LensEvidence.SUFFICIENT
+
+    @property
+    def observable(self) -> bool:
+        """Whether λ is observable, or known."""
+        return self.evidence is LensEvidence.SUFFICIENT
 
     def refined(self, free: BoolArray) -> Self:
         """With the parameters that were freed in the end."""

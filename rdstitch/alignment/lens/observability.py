@@ -10,7 +10,7 @@ from rdstitch.alignment.alignment_options import GivenImages
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentResult
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import CameraPriors
-from rdstitch.alignment.lens.lens_selection import LensChoice, choose_lens, residual_coherence
+from rdstitch.alignment.lens.lens_selection import LensChoice, LensEvidence, choose_lens, residual_coherence
 from rdstitch.alignment.noise import COHERENT_CORRELATION, shows_relief
 from rdstitch.alignment.pairwise import pairwise_homographies, relations_at
 from rdstitch.arrays import BoolArray, FloatArray
@@ -42,15 +42,13 @@ def choose_observable_lens(
     votes = vote([k.relation.distortion for k in task.links], [k.relation.distortion_std for k in task.links])
     links = links_at(np.where(first, np.nan_to_num(votes.distortion), 0.0), first)
     pairwise = pairwise_homographies(links)
-    observable, depth = _observable(pairwise), False
-    if sample.image_count <= _FEW_VIEWS or not observable:
+    moving = _observable(pairwise)
+    if sample.image_count <= _FEW_VIEWS or not moving:
         with_given_lens = pairwise_homographies(links_at(given, none))
-        depth = observable and _is_depth(pairwise, with_given_lens)
-        if depth or not observable:
-            pairwise, observable = with_given_lens, False
-    if not observable:
-        choice = choose_lens(links, pairwise, ())
-        return replace(choice, reason="λ is not observable", observable=False, depth=depth)
+        if not moving or _is_depth(pairwise, with_given_lens):
+            choice = choose_lens(links, with_given_lens, ())
+            missing = LensEvidence.DEPTH if moving else LensEvidence.LITTLE_MOTION
+            return replace(choice, reason="λ is not observable", evidence=missing)
     return choose_lens(links, pairwise, options.lenses)
 
 

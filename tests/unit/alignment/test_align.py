@@ -410,7 +410,7 @@ def test_attitudes_known_exactly_determine_no_less_than_almost_exact_ones() -> N
 
 def test_an_image_that_contradicts_the_others_names_them() -> None:
     found = aligned(grid_scene(2, 1, seed=11))
-    contradicting = replace(found.links[0], image1=0, image2=2, used=False, reason=Unused.CONTRADICTS)
+    contradicting = replace(found.links[0], image1=0, image2=2, reason=Unused.CONTRADICTS)
     whole = replace(
         found, used=np.array([True, True, False]), components=((0, 1), (2,)), links=(*found.links, contradicting)
     )

@@ -8,6 +8,7 @@ import pytest
 
 from examples.worlds.alignment_scenes import grid, scene
 from rdstitch.alignment import AlignmentOptions
+from rdstitch.alignment.result import Unused
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 from rdstitch.features import Correspondences, FeatureOptions
@@ -36,7 +37,7 @@ def test_pairs_that_contradicted_what_is_left_out_are_judged_again(tmp_path: Pat
     """The pair of the other two images had been dropped for contradicting the third one, and 0 with it."""
     frames = flight(3, 3).write(tmp_path)
     found = registered(frames, OPTIONS)
-    links = tuple(replace(fit, used=2 in (fit.image1, fit.image2)) for fit in found.alignment.links)
+    links = tuple(fit if 2 in fit.images else replace(fit, reason=Unused.CONTRADICTS) for fit in found.alignment.links)
     spoiled = replace(
         found,
         alignment=replace(found.alignment, links=links, used=found.alignment.used & [False, True, True]),

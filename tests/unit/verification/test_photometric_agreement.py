@@ -116,7 +116,7 @@ def test_images_of_many_bands_are_compared() -> None:
 
 
 def _fit(i: int, j: int, inliers: int = 50) -> LinkFit:
-    return LinkFit(i, j, 100, inliers, 0.5, True)
+    return LinkFit(i, j, 100, inliers, 0.5)
 
 
 def test_a_place_that_a_float_image_does_not_know_spoils_no_other() -> None:

@@ -63,7 +63,7 @@ def test_there_are_a_few_lines_of_a_run_and_one_of_a_kind() -> None:
 
 def test_whoever_judges_keeps_to_the_table_of_rules() -> None:
     """A board shifted by a square is as straight as before: no pair of a calibration fails by where it lies."""
-    misfits = (LinkFit(0, 1, 100, 90, 0.5, True), LinkFit(1, 2, 100, 90, 0.5, True), LinkFit(2, 3, 40, 4, 0.5, True))
+    misfits = (LinkFit(0, 1, 100, 90, 0.5), LinkFit(1, 2, 100, 90, 0.5), LinkFit(2, 3, 40, 4, 0.5))
     kinds = {
         purpose: {
             finding.kind
@@ -75,7 +75,7 @@ def test_whoever_judges_keeps_to_the_table_of_rules() -> None:
 
 
 def _fitting(share: float) -> tuple[LinkFit, ...]:
-    return tuple(LinkFit(i, j, 100, int(100 * share), 0.5, True) for i, j in ((0, 1), (1, 2)))
+    return tuple(LinkFit(i, j, 100, int(100 * share), 0.5) for i, j in ((0, 1), (1, 2)))
 
 
 def test_every_kind_has_a_sentence_that_its_rules_find_all_words_for() -> None:
@@ -150,7 +150,7 @@ def test_matches_of_a_picture_may_disagree_where_it_is_more_alike_than_by_chance
     purpose: Purpose, alike: tuple[int, int], placed: bool
 ) -> None:
     """Depth, or what moved: seams go round it, or are told of; poses have nothing but their matches."""
-    given = registration(2, links=(LinkFit(0, 1, 100, 40, 0.5, True),), keypoints=(900, 900))
+    given = registration(2, links=(LinkFit(0, 1, 100, 40, 0.5),), keypoints=(900, 900))
     confirming, cells = alike
     link = replace(_checked(0.0, (0, 1), unique=False), agreement=Agreement(cells, confirming, cells, 0.6))
     found = evidence(given, purpose, checked=[link])
@@ -166,7 +166,7 @@ def _found(given: ResultEvidence, *kinds: Kind) -> list[Finding]:
 
 def _misfits(count: int, *, agree: float = 0.2, keypoints: tuple[int, ...] = (900, 900, 900)) -> list[Message]:
     """What is said of two images with so many matches, of which a share agrees with the alignment."""
-    fit = LinkFit(0, 1, count, int(agree * count), 0.5, True)
+    fit = LinkFit(0, 1, count, int(agree * count), 0.5)
     given = registration(2, keypoints=keypoints, links=(fit,))
     found = evidence(given)
     return messages_of(_found(found, Kind.PAIR_MISFITS, Kind.IMAGE_MISFITS), given)
@@ -197,7 +197,7 @@ def test_images_of_whose_matches_two_fifths_disagree_are_named() -> None:
 
 @pytest.mark.parametrize("inliers", [20, 55, 65])
 def test_a_copy_is_judged_by_its_own_matches(inliers: int) -> None:
-    links = LinkFit(0, 1, 100, 90, 0.5, True), LinkFit(0, 2, 100, inliers, 0.5, False, Unused.COPY)
+    links = LinkFit(0, 1, 100, 90, 0.5), LinkFit(0, 2, 100, inliers, 0.5, Unused.COPY)
     found = _found(evidence(registration(3, links=links, keypoints=(900,) * 3)), Kind.IMAGE_MISFITS)
     assert [finding.images for finding in found] == [(2,)] * (inliers < 60)
 
@@ -314,7 +314,7 @@ def test_errors_of_the_whole(rms: float, alike: float, relief: float | None, kin
 
 def _checked(share: float, pair: tuple[int, int], *, unique: bool) -> CheckedLink:
     agreement = Agreement(100, round(100 * share))
-    return CheckedLink(LinkFit(*pair, 9, 9, 0.5, True), agreement, Ambiguity(1, 0, 0), unique)
+    return CheckedLink(LinkFit(*pair, 9, 9, 0.5), agreement, Ambiguity(1, 0, 0), unique)
 
 
 def test_of_pairs_that_unique_places_decided_the_least_alike_is_named() -> None:

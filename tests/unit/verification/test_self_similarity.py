@@ -164,7 +164,7 @@ def test_few_images_of_a_pattern_are_held_at_once(monkeypatch: pytest.MonkeyPatc
         Frame(Path(f"{k}.png"), image=DecodedImage(np.rint(255.0 * each.grey).astype(np.uint8), None, Metadata(SIZE)))
         for k, each in enumerate(placed)
     ]
-    links = tuple(LinkFit(i, j, 100, 90, 0.5, True) for i, j in ((0, 1), (1, 2), (0, 2)))
+    links = tuple(LinkFit(i, j, 100, 90, 0.5) for i, j in ((0, 1), (1, 2), (0, 2)))
     given = registration(
         [Source(frame.path, Metadata(SIZE), LENS, frame=frame) for frame in frames],
         cameras=(LENS,) * 3,

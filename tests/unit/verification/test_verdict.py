@@ -113,11 +113,11 @@ def test_images_without_texture_are_not_called_unlike(good: Registration, tmp_pa
 
 
 def _checked(cells: int, confirming: int, *, pair: tuple[int, int] = (0, 1), elsewhere: float = 0.0) -> CheckedLink:
-    fit = LinkFit(*pair, 100, 90, 0.5, True)
+    fit = LinkFit(*pair, 100, 90, 0.5)
     return CheckedLink(fit, Agreement(cells, confirming, 10 * cells), Ambiguity(0.9, elsewhere, 0.25))
 
 
-CHAIN = tuple(LinkFit(k, k + 1, 100, 90, 0.5, True) for k in range(2))
+CHAIN = tuple(LinkFit(k, k + 1, 100, 90, 0.5) for k in range(2))
 
 
 def _judged(*checked: CheckedLink, purpose: Purpose = Purpose.TRAJECTORY, **known: Any) -> list[Message]:
@@ -171,7 +171,7 @@ def test_what_only_the_places_suffer_from_is_not_said_of_a_lens() -> None:
 
 
 def test_only_pairs_without_which_the_images_fall_apart_decide() -> None:
-    used = [LinkFit(i, j, 100, 90, 0.5, True) for i, j in ((0, 1), (1, 2), (0, 2), (2, 3))]
+    used = [LinkFit(i, j, 100, 90, 0.5) for i, j in ((0, 1), (1, 2), (0, 2), (2, 3))]
     assert verdict.decisive_pairs({(0, 1)}, used, 4) == []
     assert verdict.decisive_pairs([(0, 1), (2, 3)], used, 4) == [(2, 3)]
     assert verdict.decisive_pairs([(0, 1), (0, 2)], used, 4) == [(0, 1), (0, 2)]
