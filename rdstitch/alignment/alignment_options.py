@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.alignment.least_squares.plane_marks import ControlPoints, Sighting
-from rdstitch.alignment.least_squares.priors import CameraPriors, known_focal
+from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.lens.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.arrays import FloatArray
@@ -19,6 +19,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.places import contradicting_places
 from rdstitch.inputs.delays import DELAYS
 from rdstitch.matching.links import Link
+from rdstitch.robust.posterior import known_focal
 
 FEWEST_MATCHES = 5
 """Of a link: through four points goes a homography, whichever they are."""

@@ -17,14 +17,18 @@ SAME_PX = 0.5
 
 _MIN_SAME = 0.9  # share of the matches that do: of an image that shows something else beside what is static, more move
 _NEAR = 0.02  # of the width and the height, that matches of a near copy move by at most: an overlap of 97 % at least
+_NOT_AT_ALL = np.eye(3)
 
 
 def copies_of(pairs: Sequence[PairRegistration]) -> dict[int, int]:
     """Of each image that is a copy, by its index, the first image that it is a copy of."""
     result: dict[int, int] = {}
+    moved: dict[int, FloatArray] = {}  # from their first images
     for pair in sorted(pairs, key=lambda pair: pair.images):
-        if not {*pair.images} & result.keys() and _moves_within(pair, np.full(2, SAME_PX)):
-            result[pair.image2] = pair.image1
+        before = moved.get(pair.image1, _NOT_AT_ALL)
+        if pair.image2 not in result and _moves_within(pair, np.full(2, SAME_PX), before):
+            result[pair.image2] = result.get(pair.image1, pair.image1)
+            moved[pair.image2] = pair.relation.homography @ before
     return result
 
 
@@ -60,15 +64,24 @@ def without_copies(pairs: Sequence[PairRegistration], copies: Mapping[int, int])
     return result
 
 
-def _moves_within(pair: PairRegistration, limits: FloatArray) -> bool:
-    """Whether what both show moves by at most so many pixels (2,), by the corners first: they tell most pairs."""
+def _moves_within(pair: PairRegistration, limits: FloatArray, before: FloatArray = _NOT_AT_ALL) -> bool:
+    """Whether what both show moves by at most so many pixels (2,), by the corners first: they tell most pairs.
+
+    From the original on, where image 1 is a copy to which ``before`` (3, 3) leads.
+    """
     relation = pair.relation
     if not relation or relation.camera.image_size != relation.camera2.image_size:
         return False
-    corners = relation.camera.normalize(border_of(relation.camera.image_size, 1))
-    with np.errstate(all="ignore"):
-        moved = transfer(relation.homography, relation.distortion, corners, relation.camera.higher) - corners
-    if not (np.linalg.norm(moved * relation.camera.scale / limits, axis=1) < 2.0).all():
+    camera = relation.camera
+
+    def shifts(homography: FloatArray, points: FloatArray) -> FloatArray:
+        normalized = camera.normalize(points)
+        with np.errstate(all="ignore"):
+            return (transfer(homography, camera.distortion, normalized, camera.higher) - normalized) * camera.scale
+
+    corners = border_of(camera.image_size, 1)
+    if not (np.linalg.norm(shifts(relation.homography @ before, corners) / limits, axis=1) < 2.0).all():
         return False
     matches = pair.correspondences
-    return bool(np.mean(np.linalg.norm((matches.points2 - matches.points1) / limits, axis=1) < 1.0) >= _MIN_SAME)
+    moved = matches.points2 - matches.points1 + shifts(before, matches.points1)
+    return bool(np.mean(np.linalg.norm(moved / limits, axis=1) < 1.0) >= _MIN_SAME)

@@ -5,7 +5,7 @@ and matches, which lie in the cache of the run, and give names back.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from threading import Lock
 from typing import NamedTuple
@@ -115,7 +115,7 @@ Tilt = tuple[float, float]
 
 
 class EstimationTask(NamedTuple):
-    """A pair to be estimated; of the lens of its cameras only the centre and the focal length are used."""
+    """A pair to be estimated."""
 
     camera1: Camera
     camera2: Camera
@@ -125,11 +125,9 @@ class EstimationTask(NamedTuple):
 
     def pair_matches(self) -> PairMatches:
         """As estimation takes them."""
-        putative, camera = self.matches.load(), self.camera1
-        first = camera.without_lens().with_focal(camera.focal, camera.focal_source or "guess", camera.focal_std)
+        putative = self.matches.load()
         known = None if self.tilt1 is None or self.tilt2 is None else np.array([self.tilt1, self.tilt2])
-        second = replace(first.resized(self.camera2.image_size), center=self.camera2.center)
-        return PairMatches(putative.points1, putative.points2, first, second, -putative.ratio, known)
+        return PairMatches(putative.points1, putative.points2, self.camera1, self.camera2, -putative.ratio, known)
 
 
 def estimate_pairs(

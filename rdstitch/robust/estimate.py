@@ -14,11 +14,11 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography, are_homographies
 from rdstitch.options.estimation_options import EstimationOptions
 from rdstitch.robust.chance import MIN_OCCUPIED_CELLS, occupied_cells, rejection_reason
-from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
+from rdstitch.robust.measurements import Measurements, as_numbers, checked_matches, padded_length
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import ModelSelection, PairFit, StartedPairs, rms_of
 from rdstitch.robust.pair_models import PlanarPairModel
-from rdstitch.robust.posterior import Prior, focal_prior
+from rdstitch.robust.posterior import Prior, focal_prior, known_focal
 from rdstitch.robust.ransac import Hypotheses, ransac
 
 _NOT_IN_AUTO = "four_point"  # finds what three points find, from more samples
@@ -28,21 +28,33 @@ _MATCHES_AT_ONCE = 1 << 14
 
 @dataclass(frozen=True, eq=False)
 class PairMatches:
-    """Matches of one pair of images, and what is known of the cameras."""
+    """Matches of one pair of images, and what is known of the cameras.
+
+    Of these, sizes, distortion centres and focal lengths are used: one lens took both images, so λ and the focal length
+    in half diagonals are shared. Where cameras differ in what is shared, it is less certain; where none has a focal
+    length, it is guessed. What lens they have is not used.
+    """
 
     points1: FloatArray  # points1, points2: (N, 2): measured points of image 1 and image 2, pixels
     points2: FloatArray
-    camera1: Camera  # camera1, camera2: with the focal length and the distortion centre; one lens, so λ is shared
+    camera1: Camera  # camera1, camera2: of one lens, whatever was given
     camera2: Camera
     quality: FloatArray | None = None  # (N,): how much each match can be trusted, the higher the better
     tilts: FloatArray | None = None  # (2, 2): known (ψ, θ) of both images, radians
 
     def __post_init__(self) -> None:
         checked_matches(self.points1, self.points2)
-        if self.camera1.focal is None or self.camera2.focal is None:
-            raise ArgumentError("the cameras of a pair need focal lengths: see Camera.with_focal")
+        log_focal, log_std, source = known_focal((self.camera1, self.camera2))
+        first = self.camera1.without_lens()
+        focal = math.exp(log_focal) * first.scale
+        first = first.with_focal(focal, source, log_std * focal)
+        second = replace(first.resized(self.camera2.image_size), center=self.camera2.center)
+        object.__setattr__(self, "camera1", first)
+        object.__setattr__(self, "camera2", second)
         if self.quality is not None and self.quality.shape != (len(self),):
             raise ArgumentError(f"quality must have shape ({len(self)},), not {self.quality.shape}")
+        if self.quality is not None and np.isnan(self.quality).any():
+            raise ArgumentError("quality has values that are NaN")
         if self.tilts is not None and self.tilts.shape != (2, 2):
             raise ArgumentError(f"tilts must have shape (2, 2), not {self.tilts.shape}")
 
@@ -157,8 +169,7 @@ def estimate_radial_homography(
         camera1 = replace(camera1, center=center)
     options = EstimationOptions(solver, threshold, confidence, max_iterations, seed, distortion)
     p1, p2 = checked_matches(points1, points2)
-    weights = None if quality is None else np.asarray(quality, dtype=np.float64)
-    camera1 = camera1.with_focal()
+    weights = None if quality is None else as_numbers("quality", quality)
     pair = PairMatches(p1, p2, camera1, camera1.resized(size2), weights, _tilts(tilt))
     return estimate_radial_homographies([pair], options)[0]
 
@@ -235,10 +246,7 @@ def _tilts(tilt: ArrayLike | None) -> FloatArray | None:
     """Of both images."""
     if tilt is None:
         return None
-    try:
-        angles = np.asarray(tilt, dtype=np.float64)
-    except (TypeError, ValueError):
-        angles = np.empty(0)
+    angles = as_numbers("tilt", tilt)
     if angles.shape not in ((2,), (2, 2)) or not np.isfinite(angles).all():
         raise ArgumentError(f"tilt must be (psi, theta) or one such pair an image, finite, not {tilt!r}")
     return np.broadcast_to(angles, (2, 2))

@@ -80,9 +80,17 @@ def padded_length(count: int) -> int:
     return -(-count // step) * step
 
 
+def as_numbers(name: str, values: ArrayLike) -> FloatArray:
+    """An argument as an array of float64; ArgumentError where it is none."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ArgumentError(f"{name} must be an array of numbers") from None
+
+
 def checked_matches(points1: ArrayLike, points2: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Matches as two arrays (N, 2) of float64; ArgumentError where shapes differ or a value is not finite."""
-    p1, p2 = np.asarray(points1, dtype=np.float64), np.asarray(points2, dtype=np.float64)
+    p1, p2 = as_numbers("points1", points1), as_numbers("points2", points2)
     for name, points in (("points1", p1), ("points2", p2)):
         if points.ndim != 2 or points.shape[1] != 2:
             raise ArgumentError(f"{name} must have shape (N, 2), not {points.shape}")

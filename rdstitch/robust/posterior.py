@@ -38,6 +38,7 @@ tilt of a plane         0 ± 20°; 0 ± 45° (0.2)       what is laid flat is lo
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Self
@@ -45,6 +46,8 @@ from typing import Self
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.geometry.camera import Camera
+from rdstitch.robust.loss import normal_std
 
 TWENTY_TO_ONE = 6.0
 """What odds cost that are said beforehand: a richer lens is rarer, ``pano`` is for turns and ``mosaic`` for planes."""
@@ -87,6 +90,8 @@ class Prior:
 
     def combined(self, value: float, std: float) -> float:
         """Where a measurement and the prior put the parameter: where their cost is least about its likeliest part."""
+        if not self.parts or std == 0.0:
+            return value
         weight, mean, scatter = np.array(self.parts).T
         spread = np.hypot(scatter, std)
         part = int(np.argmax(np.log(weight / spread) - ((value - mean) / spread) ** 2 / 2.0))
@@ -137,6 +142,19 @@ def focal_prior(log_focal: float, std: float, source: str) -> Prior:
     if source not in ("exif", "guess"):
         return Prior(((1.0, log_focal, std),))
     return Prior(((0.9, log_focal, std), (0.1, math.log(1.5), 0.7)))
+
+
+def known_focal(cameras: Sequence[Camera]) -> tuple[float, float, str]:
+    """Median and standard deviation of the logarithm of the focal length in half diagonals, and where it comes from.
+
+    The cameras are of one lens: where most differ, as those of a zoom do, it is as uncertain as they scatter.
+    """
+    known = [camera for camera in cameras if camera.focal is not None] or [cameras[0].with_focal()]
+    ratios = np.log([camera.focal / camera.scale for camera in known if camera.focal is not None])
+    middle = float(np.median(ratios))
+    scatter = normal_std(ratios - middle)
+    vaguest = max(known, key=lambda camera: camera.focal_log_std)
+    return middle, max(vaguest.focal_log_std, scatter), vaguest.focal_source or "guess"
 
 
 LENS = (

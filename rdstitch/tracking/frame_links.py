@@ -70,7 +70,7 @@ def links_by_features(
 def _registered(frame: Frame, matched: Sequence[Matched], knowledge: CameraKnowledge) -> list[Link]:
     if not knowledge.distortion_known:
         pairs = [
-            PairMatches(points1, points2, other.frame.camera.with_focal(), frame.camera.with_focal(), quality)
+            PairMatches(points1, points2, other.frame.camera, frame.camera, quality)
             for other, points1, points2, quality in matched
         ]
         return [

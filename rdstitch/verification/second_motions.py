@@ -79,10 +79,9 @@ def second_motions(
     for batch in batches(enough, PAIRS_ESTIMATED_AT_ONCE):
         given = []
         for pair in batch:
-            first, second = (cameras[k] for k in pair.images)
-            camera = first.without_lens().with_focal()
-            matches, other = pair.correspondences.take(rests[pair.images]), camera.resized(second.image_size)
-            given.append(PairMatches(matches.points1, matches.points2, camera, other, -matches.ratio))
+            matches = pair.correspondences.take(rests[pair.images])
+            first, second = (cameras[k].without_focal() for k in pair.images)
+            given.append(PairMatches(matches.points1, matches.points2, first, second, -matches.ratio))
         motions = estimate_radial_homographies(given, EstimationOptions(threshold=threshold))
         for pair, motion in zip(batch, motions, strict=True):
             if motion and int(motion.inliers.sum()) >= Limits.min_motion_inliers:

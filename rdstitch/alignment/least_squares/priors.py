@@ -3,7 +3,6 @@
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
@@ -13,7 +12,7 @@ import numpy as np
 from rdstitch.alignment.least_squares.plane_marks import ControlPoints, PlaneMarks
 from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, X, Y
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
+from rdstitch.geometry.camera import LENS_PARAMETERS
 from rdstitch.robust.posterior import LENS, TILT, Prior, exact, focal_prior
 
 _MOST_BARREL = 0.375
@@ -109,11 +108,3 @@ class CameraPriors:
             control=self.control.within(images),
             delayed_attitudes=None if self.delayed_attitudes is None else self.delayed_attitudes[images],
         )
-
-
-def known_focal(cameras: Sequence[Camera]) -> tuple[float, float, str]:
-    """Mean and standard deviation of the logarithm of the focal length in half diagonals, and where it comes from."""
-    known = [camera for camera in cameras if camera.focal is not None] or [cameras[0].with_focal()]
-    ratios = [camera.focal / camera.scale for camera in known if camera.focal is not None]
-    vaguest = max(known, key=lambda camera: camera.focal_log_std)
-    return float(np.log(np.median(ratios))), vaguest.focal_log_std, vaguest.focal_source or "guess"

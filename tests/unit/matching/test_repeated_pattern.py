@@ -17,7 +17,7 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features import Correspondences, FeatureOptions, Features, detect, match
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
-from rdstitch.matching.copies import near_copies_of
+from rdstitch.matching.copies import copies_of, near_copies_of, without_copies
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.pair_estimator import FeatureMatching, PairEstimator
 from rdstitch.matching.repeated_pattern import _MIN_REPETITION, match_pattern, match_repeated_patterns, repetition
@@ -318,6 +318,26 @@ def test_a_near_copy_changes_nothing_and_lies_where_it_was_taken() -> None:
     points = np.array([[40.0, 30.0], [160.0, 120.0], [280.0, 200.0]])
     # Its lens has the centre 4 pixels off the middle.
     np.testing.assert_allclose(found.transfer(1, 3, points), points - np.array([4.0, 0.0]), atol=0.6)
+
+
+def _shifted(image1: int, image2: int, pixels: float) -> PairRegistration:
+    homography = np.eye(3)
+    homography[0, 2] = pixels / CAMERA.scale
+    relation = RadialHomography(homography, CAMERA.with_coefficients(0.0), CAMERA, np.ones(300, dtype=np.bool_))
+    return PairRegistration(image1, image2, stored(POINTS, POINTS + np.array([pixels, 0.0])), relation)
+
+
+@pytest.mark.parametrize("neighbours", [1, 2, 3])
+def test_copies_of_copies_are_copies_of_the_first_image(neighbours: int) -> None:
+    pairs = [_shifted(i, i + k, 0.0) for i in range(10) for k in range(1, neighbours + 1) if i + k < 10]
+    copies = copies_of(pairs)
+    assert copies == dict.fromkeys(range(1, 10), 0)
+    assert not without_copies(pairs, copies)
+
+
+def test_what_moves_slowly_is_no_copy_of_where_it_was_long_ago() -> None:
+    pairs = [_shifted(i, i + 1, 0.2) for i in range(10)]
+    assert copies_of(pairs) == {1: 0, 2: 0, 4: 3, 5: 3, 7: 6, 8: 6, 10: 9}
 
 
 def test_what_only_a_near_copy_reaches_is_no_less_joined() -> None:

@@ -31,9 +31,11 @@ TRUE = MATCHES.truth.motion
         ({"tilt": (0.1, 0.2, 0.3)}, "tilt must be"),
         ({"tilt": (np.nan, 0.2)}, "tilt must be"),
         ({"tilt": np.zeros((3, 2))}, "tilt must be"),
-        ({"tilt": "a"}, "tilt must be"),
+        ({"tilt": "a"}, "tilt must be an array of numbers"),
         ({"center": (340.0, 240.0), "image_size2": (480, 640)}, "turned by a quarter"),
         ({"quality": np.ones(7)}, "quality must have shape"),
+        ({"quality": ["a"] * 150}, "quality must be an array of numbers"),
+        ({"quality": np.full(150, np.nan)}, "quality has values that are NaN"),
         ({"solver": "two_point"}, "needs the tilt"),
     ],
 )
@@ -46,7 +48,7 @@ def test_a_pair_is_checked_where_it_is_made() -> None:
     points, lens = MATCHES.points1, LENS.with_focal()
     for wrong, says in (
         ((points, points * np.nan, lens, lens), "not finite"),
-        ((points, points, lens, Camera((640, 480))), "focal length"),
+        (([["a", "b"]], points, lens, lens), "points1 must be an array of numbers"),
         ((points, points, lens, lens, np.ones(3)), "quality must have shape"),
         ((points, points, lens, lens, None, np.zeros(2)), "tilts must have shape"),
     ):
@@ -100,6 +102,32 @@ def test_each_image_keeps_its_distortion_centre() -> None:
         [PairMatches(points, turned, camera, camera.turned(6))], EstimationOptions()
     )
     np.testing.assert_allclose(found.transfer(points), turned, atol=1e-3)
+
+
+def test_what_the_lens_of_the_cameras_was_is_not_used() -> None:
+    folded = LENS.with_coefficients(-0.1, -0.05, 0.01)
+    plain, bent = estimate_radial_homographies(
+        [PairMatches(MATCHES.points1, MATCHES.points2, camera, camera) for camera in (LENS, folded)],
+        EstimationOptions(),
+    )
+    assert bent.camera == plain.camera
+    np.testing.assert_array_equal(bent.transfer(MATCHES.points1), plain.transfer(MATCHES.points1))
+
+
+@pytest.mark.parametrize("focals", [(600.0, 1200.0), (1200.0, 600.0)])
+def test_focal_lengths_that_differ_count_as_uncertain_in_either_order(focals: tuple[float, float]) -> None:
+    first, second = (Camera((640, 480)).with_focal(focal, "exif") for focal in focals)
+    pair = PairMatches(MATCHES.points1, MATCHES.points2, first, second)
+    assert pair.camera1.focal == pair.camera2.focal == pytest.approx(600.0 * np.sqrt(2.0))
+    assert all(pair.focal_prior.cost(np.log(focal / first.scale)) < 1.0 for focal in focals)
+
+
+def test_a_focal_length_that_one_image_states_is_that_of_both() -> None:
+    stated, unknown = Camera((640, 480)).with_focal(600.0, "exif"), Camera((320, 240))
+    for first, second in ((stated, unknown), (unknown, stated)):
+        pair = PairMatches(MATCHES.points1, MATCHES.points2, first, second)
+        assert pair.camera1.focal == pytest.approx(600.0 * first.image_size[0] / 640)
+        assert pair.camera1.focal_log_std == pytest.approx(0.05)
 
 
 def test_too_few_matches_are_no_result_but_a_reason() -> None:

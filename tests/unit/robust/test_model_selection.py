@@ -254,6 +254,11 @@ def test_a_measurement_and_a_prior_meet_by_their_variances(value: float, std: fl
     assert LENS[0].combined(value, std) == pytest.approx(found, abs=1e-4)
 
 
+def test_a_measurement_stands_without_a_prior_or_where_it_is_exact() -> None:
+    assert Prior().combined(0.3, 1.0) == 0.3
+    assert LENS[0].combined(0.3, 0.0) == 0.3
+
+
 @pytest.mark.parametrize("std", [0.01, 0.03, 0.08])
 @pytest.mark.parametrize("value", [-0.14, -0.125, -0.12])
 def test_near_the_crossing_of_two_parts_they_meet_where_both_together_put_them(value: float, std: float) -> None:
