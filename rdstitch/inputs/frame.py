@@ -108,6 +108,7 @@ def array_as_image(name: str, array: NDArray[Any], channel_order: ChannelOrder) 
     """An array as the readers of files give it: in RGB order, alpha apart, and a copy, since buffers are reused."""
     if array.ndim not in (2, 3) or array.size == 0:
         raise ArgumentError(f"{name}: expected an array of shape (H, W) or (H, W, C), not {array.shape}")
+    array = array.astype(array.dtype.newbyteorder("="), copy=False)
     if array.dtype not in (np.uint8, np.uint16) and array.dtype.kind != "f":
         raise ArgumentError(f"{name}: expected uint8, uint16 or floating-point samples, not {array.dtype}")
     channels = 1 if array.ndim == 2 else array.shape[2]

@@ -8,8 +8,7 @@ from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.image_folders import images_in, is_rdstitch_output, natural_key
 from rdstitch.system.file_access import file_state
 
-_POLL_SECONDS = 0.2  # between two looks
-_COMPLETE_AFTER_SECONDS = 1.0  # after its last change, from which on a file is read at the first look
+_POLL_SECONDS = 0.2  # between two looks; a file that has not changed for so long is read
 _GIVE_UP_SECONDS = 3.0  # after its last change, from which on a file that is not whole is reported
 
 _State = tuple[int, int]  # size and time of the last change
@@ -22,7 +21,9 @@ class GrowingFolder:
         self._folder, self._idle = folder, idle
         self._done: set[Path] = set()
         self._not_whole: dict[Path, _State] = {}  # files, and the state that they were read at
-        self._seen: dict[Path, _State] = {}  # files that may still be written, as they were at the last look
+        # the state of each file at the last look, and since when it has been in it by our clock: the times of files may
+        # come from other machines' clocks
+        self._seen: dict[Path, tuple[_State, float]] = {}
 
     def comes_again(self, frame: Frame) -> bool:
         """Whether a frame whose file is not whole will come again, since its file may still be written.
@@ -32,7 +33,7 @@ class GrowingFolder:
         if (state := file_state(frame.path)) is None:
             return False
         self._not_whole[frame.path] = state
-        if _age(state) > _GIVE_UP_SECONDS:
+        if self._unchanged_for(frame.path, state) > _GIVE_UP_SECONDS:
             return False
         self._done.discard(frame.path)
         return True
@@ -45,7 +46,6 @@ class GrowingFolder:
             for path in sorted(complete, key=natural_key):
                 self._done.add(path)
                 self._not_whole.pop(path, None)
-                self._seen.pop(path)
                 if not is_rdstitch_output(path):
                     yield Frame(path)
                     last = time.monotonic()
@@ -55,7 +55,7 @@ class GrowingFolder:
                 time.sleep(_POLL_SECONDS)
 
     def _look(self) -> tuple[list[Path], bool]:
-        """The files that are complete now, and whether one that was not whole may become so."""
+        """The files that are complete now, and whether others, in which something is already, may become so."""
         complete, waiting = [], False
         for path in images_in(self._folder):
             read_at, done = self._not_whole.get(path), path in self._done
@@ -64,17 +64,17 @@ class GrowingFolder:
             state = file_state(path)
             if state is None or (done and state == read_at):
                 continue
-            still = self._seen.get(path) == state
-            self._seen[path] = state
-            if read_at is None:
-                ready = still or _age(state) > _COMPLETE_AFTER_SECONDS
-            else:
-                waiting = True
-                ready = (still and state != read_at) or _age(state) > _GIVE_UP_SECONDS
-            if state[0] and ready:
+            waiting |= state[0] > 0
+            long_enough = _GIVE_UP_SECONDS if state == read_at else _POLL_SECONDS
+            if self._unchanged_for(path, state) > long_enough and state[0]:
                 complete.append(path)
         return complete, waiting
 
-
-def _age(state: _State) -> float:
-    return time.time() - state[1] / 1e9
+    def _unchanged_for(self, path: Path, state: _State) -> float:
+        """Seconds that a file has been seen in this state."""
+        before, since = self._seen.get(path, (None, 0.0))
+        now = time.monotonic()
+        if state == before:
+            return now - since
+        self._seen[path] = state, now
+        return 0.0

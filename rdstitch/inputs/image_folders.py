@@ -32,9 +32,10 @@ def is_raw_or_heif(path: Path) -> bool:
     return path.suffix.lower() in HEIF_SUFFIXES | RAW_SUFFIXES
 
 
-def natural_key(path: Path) -> list[tuple[int, str | int]]:
-    """Sorting key by which ``frame10`` comes after ``frame9``."""
-    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", str(path)) if part]
+def natural_key(path: Path) -> tuple[list[tuple[int, str | int]], str]:
+    """Sorting key by which ``frame10`` comes after ``frame9``; ``frame9`` and ``frame09`` do not share one."""
+    text = str(path)
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", text) if part], text
 
 
 def place_of(path: Path) -> Path:

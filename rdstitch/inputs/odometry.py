@@ -105,7 +105,8 @@ def _listed_pose(where: str, line: str) -> tuple[float, ...]:
 
 def odometry_of(rows: Sequence[tuple[float, ...]], where: str) -> Odometry:
     """From rows of time, x, y, yaw (radians), and the variances of a coordinate and of the yaw."""
-    values = np.array(sorted(rows), dtype=np.float64).reshape(-1, 6)
+    # Of several at one time the last counts.
+    values = np.array(sorted(rows, key=lambda row: row[0]), dtype=np.float64).reshape(-1, 6)
     values = values[np.append(np.diff(values[:, 0]) > 0.0, True)] if len(values) else values
     if len(values) < 2:
         raise InputError(f"{where}: has no odometry at two times")

@@ -23,6 +23,7 @@ _DESCRIPTION, _KEY, _HEADER = "metadata.yaml", b"rosbag2_bagfile_information", 4
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 IMAGE_TYPES = ("sensor_msgs/msg/Image", COMPRESSED)
 _ODOMETRY = "nav_msgs/msg/Odometry"
+_RECTIFIED = {"rect", "rectified"}  # words, between underscores, of topics of rectified images
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 
 
@@ -60,13 +61,14 @@ def camera_in_bag(path: Path, topic: str | None = None) -> "tuple[CameraFile, st
     """The calibration that the bag has for a topic of images, and its own topic; None where it has none.
 
     That is the one beside the images, ``/camera/camera_info`` for ``/camera/image_raw``. Of images that are rectified
-    already (``image_rect``) it is that of the rectified camera.
+    already (``image_rect``) it is that of the rectified camera; of a region of interest it is that of this region.
     """
     from rdstitch.camera_files import camera_of_content
 
     with opened_bag(path) as reader:
         images = chosen_topic(path, reader, topic)
-        info_topic = f"{images.removesuffix('/compressed').rpartition('/')[0]}/camera_info"
+        folder, _, name = images.removesuffix("/compressed").rpartition("/")
+        info_topic = f"{folder}/camera_info"
         chosen = [c for c in reader.connections if c.msgtype == _CAMERA_INFO and c.topic == info_topic]
         for connection, _, data in reader.messages(connections=chosen) if chosen else ():
             message = reader.deserialize(data, connection.msgtype)
@@ -74,9 +76,13 @@ def camera_in_bag(path: Path, topic: str | None = None) -> "tuple[CameraFile, st
             k, d, p = (np.asarray(values[name], dtype=np.float64).ravel() for name in "kdp")
             if not k[0] > 0.0:  # as a driver without a calibration writes it
                 return None
-            if "rect" in images.rpartition("/")[2] and p[0] > 0.0:
+            if not _RECTIFIED.isdisjoint(name.split("_")) and p[0] > 0.0:
                 k, d = p.reshape(3, 4)[:, :3].ravel(), d[:0]
-            content: dict[str, Any] = {"width": int(message.width), "height": int(message.height), "k": k.tolist()}
+            shown = message
+            if (region := message.roi).width and region.height:  # zeros stand for the whole image
+                shown = region
+                k = k - (0.0, 0.0, region.x_offset, 0.0, 0.0, region.y_offset, 0.0, 0.0, 0.0)
+            content: dict[str, Any] = {"width": int(shown.width), "height": int(shown.height), "k": k.tolist()}
             content["d"] = d.tolist()
             if d.size:
                 content["distortion_model"] = message.distortion_model

@@ -36,6 +36,7 @@ from rdstitch.system.records import parse_json
 IMAGE_NAMES, TIME_NAMES = "name filename file image imagename", "timestamp time stamp"  # of columns
 
 _DELIMITERS = ",;\t"
+_SEPARATOR = re.compile("sep=.?", re.IGNORECASE)
 _HEADING = re.compile(r"(?:.*:)?([^\[(]*)(?:[\[(]([^\])]*)[\])]?.*)?", re.DOTALL)
 _EMPTY = ("", "-", "nan", "n/a", "na", "none", "null")
 # A number by its decimal mark; the other mark may stand between groups of three digits.
@@ -245,8 +246,13 @@ def _column_finder(file: str, columns: Mapping[str, str], units: Mapping[str, st
 
 
 def _is_heading(line: str, column_of: Callable[[str], str | None]) -> bool:
-    """Check whether a line is the heading: the first one that is no comment, or a comment that names columns."""
-    return _names_columns(line, column_of) if line.startswith("#") else bool(line.strip())
+    """Check whether a line is the heading: the first one that is no comment, or a comment that names columns.
+
+    Nor the line ``sep=;`` by which Excel tells the delimiter, and which it writes above the heading.
+    """
+    if line.startswith("#"):
+        return _names_columns(line, column_of)
+    return bool(line.strip()) and not _SEPARATOR.fullmatch(line.strip())
 
 
 def _names_columns(line: str, column_of: Callable[[str], str | None]) -> bool:

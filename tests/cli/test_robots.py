@@ -20,6 +20,7 @@ from examples.worlds.paths import drive_poses
 from rdstitch.camera_files import load_camera
 from rdstitch.camera_files.lens_models import nearest_model
 from rdstitch.geometry.camera import Camera
+from rdstitch.inputs.rosbag import camera_in
 from rdstitch.io import read_image
 from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, rows_of, start
@@ -84,11 +85,19 @@ def test_what_cannot_be_read_keeps_its_time_and_is_counted(rdstitch: Run, frames
 
 
 def _write_bag(
-    folder: Path, frames: list[Path], version: int, kind: str, focal: float = 0.0, calibrated: str = "/camera_info"
+    folder: Path,
+    frames: list[Path],
+    version: int,
+    kind: str,
+    focal: float = 0.0,
+    calibrated: str = "/camera_info",
+    topic: str = "/camera",
+    margin: int = 0,
 ) -> Path:
     """A bag with the frames on /camera at 2 Hz from 1000 s on; with a camera's calibration if it has a focal length.
 
-    That has the division model's lens as ROS's rational polynomial.
+    That has the division model's lens as ROS's rational polynomial. With a margin, the images are a region of larger
+    ones.
     """
     typesys = pytest.importorskip("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if version == 1 else typesys.Stores.LATEST)
@@ -97,7 +106,7 @@ def _write_bag(
     writer: Any = import_module(f"rosbags.rosbag{version}").Writer(path, **({"version": 9} if version == 2 else {}))
     name = "sensor_msgs/msg/CompressedImage" if kind == "compressed" else "sensor_msgs/msg/Image"
     with writer:
-        connection = writer.add_connection("/camera", name, typestore=store)
+        connection = writer.add_connection(topic, name, typestore=store)
         for number, frame in enumerate(frames):
             sec, nanosec = divmod(500_000_000 * number, 10**9)
             stamp = time_type(sec=1000 + sec, nanosec=nanosec)
@@ -106,19 +115,24 @@ def _write_bag(
             data = (store.serialize_ros1 if version == 1 else store.serialize_cdr)(message, name)
             writer.write(connection, 10**12 + number, data)
         if focal:
-            message = _camera_info(store, header, Camera((400, 300), DISTORTION, focal=focal))
+            message = _camera_info(store, header, Camera((400, 300), DISTORTION, focal=focal), margin)
             connection = writer.add_connection(calibrated, message.__msgtype__, typestore=store)
             writer.write(connection, 10**12, store.serialize_cdr(message, message.__msgtype__))
     return path
 
 
-def _camera_info(store: Any, header: Any, camera: Camera) -> Any:
+def _camera_info(store: Any, header: Any, camera: Camera, margin: int) -> Any:
     lens, _, _ = nearest_model(camera, {"rational": ""})
-    k = np.array([camera.focal, 0.0, camera.center[0], 0.0, camera.focal, camera.center[1], 0.0, 0.0, 1.0])
-    none = store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, do_rectify=False)
+    x, y = (value + margin for value in camera.center)
+    k = np.array([camera.focal, 0.0, x, 0.0, camera.focal, y, 0.0, 0.0, 1.0])
+    p = np.insert(k.reshape(3, 3), 3, 0.0, axis=1).ravel()
+    shown = camera.image_size if margin else (0, 0)
+    fields = {"x_offset": margin, "y_offset": margin, "height": shown[1], "width": shown[0], "do_rectify": False}
+    region = store.types["sensor_msgs/msg/RegionOfInterest"](**fields)
     of_lens = {"distortion_model": "rational_polynomial", "d": np.array(lens.coefficients), "k": k}
-    other = {"r": np.eye(3).ravel(), "p": np.zeros(12), "binning_x": 0, "binning_y": 0, "roi": none}
-    return store.types["sensor_msgs/msg/CameraInfo"](header=header, height=300, width=400, **of_lens, **other)
+    other = {"r": np.eye(3).ravel(), "p": p, "binning_x": 0, "binning_y": 0, "roi": region}
+    size = {"width": camera.image_size[0] + 2 * margin, "height": camera.image_size[1] + 2 * margin}
+    return store.types["sensor_msgs/msg/CameraInfo"](header=header, **size, **of_lens, **other)
 
 
 def _message(message: Any, header: Any, frame: Path, kind: str) -> Any:
@@ -164,6 +178,26 @@ def test_the_calibration_in_a_bag_is_used(rdstitch: Run, frames: list[Path], tmp
     assert last["x"] == pytest.approx(float(rows_of(tmp_path / "path.csv")[-1]["x"]), rel=0.05)
     same = rdstitch("trajectory", *frames, "--camera", bag, "-o", tmp_path / "files.csv", *CACHED)
     assert same.out == done.out
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind", "rectified"),
+    [
+        ("/cam/image_direct", "bgr8", False),
+        ("/cam/image_rect_color", "bgr8", True),
+        ("/cam/image_rect/compressed", "compressed", True),
+    ],
+)
+@pytest.mark.parametrize("margin", [0, 50])
+def test_which_images_of_a_bag_are_rectified_and_which_part_they_show(
+    topic: str, kind: str, rectified: bool, margin: int, frames: list[Path], tmp_path: Path
+) -> None:
+    shown = {"calibrated": "/cam/camera_info", "topic": topic, "margin": margin}
+    camera = camera_in(_write_bag(tmp_path, frames[:1], 2, kind, focal=380.0, **shown))
+    assert camera.image_size == (400, 300)
+    assert camera.center == pytest.approx((199.5, 149.5), abs=0.01)
+    assert camera.focal == pytest.approx(380.0)
+    assert camera.nearest_distortion == pytest.approx(0.0 if rectified else DISTORTION, abs=0.01)
 
 
 def test_the_calibration_of_another_camera_is_not_used(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

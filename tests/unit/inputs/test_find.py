@@ -1,6 +1,7 @@
 """Finding the inputs, and choosing among them."""
 
 import re
+from itertools import permutations
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -12,7 +13,8 @@ from PIL import Image
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.find import find_images
-from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.frame import Frame, as_inputs
+from rdstitch.inputs.image_folders import natural_key
 from rdstitch.inputs.rosbag_images import _ENCODINGS, _eight_bits, _grey_of_compressed, _pixels
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import read_sources
@@ -26,6 +28,23 @@ def images(folder: Path, count: int) -> list[Path]:
     for path in paths:
         Image.new("L", (32, 24)).save(path)
     return paths
+
+
+def test_names_of_one_number_have_one_order() -> None:
+    names = [Path(name) for name in ("img2.png", "img1.png", "img01.png", "img001.png")]
+    orders = {tuple(sorted(some, key=natural_key)) for some in permutations(names)}
+    assert len(orders) == 1
+    assert orders.pop()[-1].name == "img2.png"
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_samples_of_either_byte_order_are_taken(order: str) -> None:
+    samples = np.arange(48, dtype=f"{order}u2").reshape(4, 6, 2)
+    (frame,) = as_inputs(samples)
+    assert isinstance(frame, Frame)
+    assert frame.image is not None
+    assert frame.image.pixels.dtype == np.uint16
+    np.testing.assert_array_equal(frame.image.pixels, samples[..., 0])
 
 
 def video(path: Path) -> Path:

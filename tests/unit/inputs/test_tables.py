@@ -55,6 +55,12 @@ def test_headings_quotes_comments_and_paths() -> None:
     assert _rows("name,x [µm]\na,5\n")[0].number("um") == 5.0
 
 
+@pytest.mark.parametrize("first", ["sep=;", "SEP=;\r"])
+def test_the_line_by_which_excel_tells_the_delimiter_is_no_heading(first: str) -> None:
+    (row,) = _rows(f"{first}\nname;x;y\na.jpg;48,5;11,25\n")
+    assert (row.image, row.number("x"), row.where) == ("a.jpg", 48.5, "t.csv: line 3")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

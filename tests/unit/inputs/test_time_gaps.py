@@ -39,6 +39,12 @@ def test_odometry_that_stopped_has_no_pose_between() -> None:
     assert [time for time, pose in at.items() if pose is not None] == [28.5, 29.0, 630.0]
 
 
+def test_of_several_poses_at_one_time_the_last_counts() -> None:
+    rows = [(2.0, 9.0), (1.0, 5.0), (1.0, 2.0), (0.0, 0.0)]
+    odometry = odometry_of([(time, x, 0.0, 0.0, np.nan, np.nan) for time, x in rows], "odometry")
+    assert odometry.poses[:, 0].tolist() == [0.0, 2.0, 9.0]
+
+
 def test_an_attitude_in_a_gap_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "imu.csv").write_text("timestamp,psi,theta\n" + "".join(f"{time},1,2\n" for time in SECONDS))
     with_attitudes(_taken(28.5, 640.2), tmp_path / "imu.csv")
