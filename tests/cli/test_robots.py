@@ -192,8 +192,8 @@ def test_the_calibration_in_a_bag_is_used(rdstitch: Run, frames: list[Path], tmp
 def test_which_images_of_a_bag_are_rectified_and_which_part_they_show(
     topic: str, kind: str, rectified: bool, margin: int, frames: list[Path], tmp_path: Path
 ) -> None:
-    shown = {"calibrated": "/cam/camera_info", "topic": topic, "margin": margin}
-    camera = camera_in(_write_bag(tmp_path, frames[:1], 2, kind, focal=380.0, **shown))
+    bag = _write_bag(tmp_path, frames[:1], 2, kind, 380.0, "/cam/camera_info", topic, margin)
+    camera = camera_in(bag)
     assert camera.image_size == (400, 300)
     assert camera.center == pytest.approx((199.5, 149.5), abs=0.01)
     assert camera.focal == pytest.approx(380.0)
