@@ -20,7 +20,7 @@ from rdstitch.compositing.boxes import Box
 # Pixels of images with a diagonal of 1000:
 _NEAR = 8  # from a place within which a line counts there, as far as places are apart
 _ACROSS = 6  # of the profile on either side of a line
-_MIN_SIDE = 6  # of a line on either side of a seam that are compared
+_MIN_SIDE = 4  # of a line on either side of a seam that are compared
 _OFF = 2  # by which a line may be off beyond a seam before it is seen to step
 _CONTINUED = 0.4  # of its contrast that a line keeps beyond a seam
 
