@@ -1,9 +1,10 @@
 """Whether the seams hold: what a person sees where one image of the output ends and the next begins.
 
-Along every border of two images, windows of both are compared. A seam is broken where the two differ at the border
-itself, and either fit clearly better with one of them moved, or lines of one do not go on in the other. What differs
-beside the border does not count: a seam that goes around a moving object holds; nor does what is finer than a seam's
-surroundings: gravel and leaves hide it.
+Along every border of two images, windows of both are compared. A place does not fit where the two differ at the border
+itself, and either fit clearly better with one of them moved, or edges of one are not in the other. What differs beside
+the border does not count: a seam that goes around a moving object holds; nor does what is finer than a seam's
+surroundings: gravel and leaves hide it. By this layouts are compared. A person sees a seam broken where, besides, a
+line of one image does not go on in the other: branches, shadows and pebbles hide it.
 """
 
 import math
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.compositing.boxes import Box, Float32Array
+from rdstitch.compositing.seam_lines import SeamLines
 from rdstitch.system.late_imports import csgraph, sparse, spatial
 
 DIAGONAL = 1000.0  # pixels of an image's diagonal at which seams are looked at: about what a screen shows of it
@@ -30,8 +32,10 @@ UNLIKE = 0.4  # correlation below which edges on both sides are not the same
 # Share of the overlaps that images of a scene reach where they do not belong, in nine of ten cases (0.1 in the median);
 # and share that what fills less than half of the images cannot reach.
 _CHANCE, _MIN_ALIKE = 0.2, 0.5
-# Coherence of edges (0: all directions, 1: one) from which on a person sees them end: leaves and gravel hide a seam.
+# Coherence of edges (0: all directions, 1: one) from which on they are an object's, and no leaves or gravel.
 _DIRECTED = 0.4
+_MIN_LINE = 2 * _HALF  # pixels of a line that a person follows: longer than the window that it crosses
+_NEXT = 2.2 * _STEP  # pixels up to which places of a border follow each other
 _MAX_SHARE, _MIN_BROKEN = 0.03, 3  # of the places that may be broken before a person sees it
 _MAX_LENGTH = 0.045  # of a break that a person does not see, diagonals of an image
 _SURELY_ALIKE = 0.9  # correlation of windows that need not be moved
@@ -62,8 +66,10 @@ class SeamQuality:
 
     # (N, 2): places along the seams at which both images have texture, pixels of the output
     places: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    broken: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (N,)
-    breaks: tuple[SeamBreak, ...] = ()  # the longest first
+    misfit: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (N,): both sides do not fit
+    broken: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (N,): and a line ends
+    misfits: tuple[SeamBreak, ...] = ()  # stretches that do not fit, the longest first
+    breaks: tuple[SeamBreak, ...] = ()  # those where a line ends
     spacing: float = math.inf  # of the places, pixels of the output
     alike: float = math.nan  # share of the overlaps that looks alike, [0, 1]; NaN where there is nothing to compare
     fills: float = math.nan  # share of the images, over all pairs, that is not seen to look different in the other
@@ -85,11 +91,14 @@ class SeamQuality:
         return float(self.broken.mean()) if len(self.broken) else 0.0
 
     @property
+    def fit(self) -> bool:
+        """Whether both sides of the seams fit, but for a few short stretches."""
+        return not self._many(self.misfit, self.misfits)
+
+    @property
     def seen(self) -> bool:
         """Whether a person sees that seams are broken: a long break, or many."""
-        longest = self.breaks[0].length if self.breaks else 0.0
-        many = self.share > _MAX_SHARE and self.broken.sum() >= _MIN_BROKEN
-        return many or longest > _MAX_LENGTH * DIAGONAL / _STEP * self.spacing
+        return self._many(self.broken, self.breaks)
 
     @property
     def visible(self) -> bool:
@@ -97,16 +106,31 @@ class SeamQuality:
         longest = max((one.length for one in self.breaks), default=0.0)
         return self.seen and (self.spacing >= _STEP or longest > 2 * _HALF)
 
+    def _many(self, counted: BoolArray, stretches: tuple[SeamBreak, ...]) -> bool:
+        longest = stretches[0].length if stretches else 0.0
+        many = counted.sum() >= _MIN_BROKEN and counted.mean() > _MAX_SHARE
+        return bool(many) or longest > _MAX_LENGTH * DIAGONAL / _STEP * self.spacing
+
     def cropped(self, box: Box) -> "SeamQuality":
         """The same of a part of the output."""
         corner, last = np.array(box[:2]), np.array(box[2:]) - 0.5
         within = ((self.places >= corner - 0.5) & (self.places < last)).all(axis=1)
-        kept = [
-            replace(one, position=(one.position[0] - box[0], one.position[1] - box[1]))
-            for one in self.breaks
-            if box[0] - 0.5 <= one.position[0] < box[2] - 0.5 and box[1] - 0.5 <= one.position[1] < box[3] - 0.5
-        ]
-        return replace(self, places=self.places[within] - corner, broken=self.broken[within], breaks=tuple(kept))
+        misfits, breaks = (
+            tuple(
+                replace(one, position=(one.position[0] - box[0], one.position[1] - box[1]))
+                for one in stretches
+                if box[0] - 0.5 <= one.position[0] < box[2] - 0.5 and box[1] - 0.5 <= one.position[1] < box[3] - 0.5
+            )
+            for stretches in (self.misfits, self.breaks)
+        )
+        return replace(
+            self,
+            places=self.places[within] - corner,
+            misfit=self.misfit[within],
+            broken=self.broken[within],
+            misfits=misfits,
+            breaks=breaks,
+        )
 
 
 def measure_seams(
@@ -119,6 +143,7 @@ def measure_seams(
     """
     pairs, at = _border_places(labels, label_size)
     searchable: dict[int, dict[int, BoolArray]] = {}  # by image
+    lines = SeamLines(labels, label_size, _HALF)
     found: list[tuple[IntArray, FloatArray, _Verdict]] = []
     ordered, start = np.unique(pairs, axis=0, return_index=True)
     for pair, along in zip(ordered, np.split(at, start[1:]), strict=False):
@@ -128,6 +153,7 @@ def measure_seams(
         for k, tile in zip(pair.tolist(), (first, second), strict=True):
             if k not in searchable:
                 searchable[k] = _searchable(tile.inside)
+                lines.add(k, tile.box, tile.grey, full, _MIN_LINE)
         areas1, areas2 = (searchable[k] for k in pair.tolist())
         here, reaches = _comparable_places((first, areas1), (second, areas2), along)
         near_border = _on_border(labels, label_size, pair)
@@ -136,9 +162,17 @@ def measure_seams(
     if not found:
         return SeamQuality(spacing=_STEP * unit)
     images, places = np.array([pair for pair, _, _ in found]), np.array([place for _, place, _ in found])
-    broken, shift = (np.array(values) for values in zip(*(verdict for _, _, verdict in found), strict=True))
-    breaks = _breaks(images, places, broken, shift, unit)
-    return SeamQuality((places + 0.5) * unit - 0.5, broken, breaks, _STEP * unit)
+    misfit, shift = (np.array(values) for values in zip(*(verdict for _, _, verdict in found), strict=True))
+    runs, broken = _runs(images, places, misfit), np.zeros_like(misfit)
+    for run in runs:
+        ends = np.array([lines.end(images[k], places[k]) for k in run])
+        near = np.hypot(*(places[run, None] - places[run]).T) <= _NEXT
+        broken[run] = (near & ends).any(axis=1)
+    misfits, breaks = (
+        tuple(sorted((_stretch(images, places, shift, run, unit) for run in each), key=lambda one: -one.length))
+        for each in (runs, _runs(images, places, broken))
+    )
+    return SeamQuality((places + 0.5) * unit - 0.5, misfit, broken, misfits, breaks, _STEP * unit)
 
 
 def _border_places(labels: NDArray[np.int32], label_size: float) -> tuple[IntArray, FloatArray]:
@@ -166,9 +200,9 @@ def _searchable(inside: BoolArray) -> dict[int, BoolArray]:
 
 
 class _Verdict(NamedTuple):
-    """Whether a seam is broken at a place, and by how much it is shifted; NaN where it does not match at all."""
+    """Whether both sides of a seam do not fit at a place, and by how much they are shifted; NaN if they are unlike."""
 
-    broken: bool
+    misfit: bool
     shift: float
 
 
@@ -202,8 +236,8 @@ def _verdicts(
         if spread[:, k].max() < contrast:
             yield None
         elif spread[:, k].min() < contrast:  # one side is empty of what the other has
-            broken = bool(differ[k] > 2.0 * contrast)
-            yield _Verdict(broken, math.nan if broken else 0.0)
+            misfit = bool(differ[k] > 2.0 * contrast)
+            yield _Verdict(misfit, math.nan if misfit else 0.0)
         elif differ[k] <= contrast or alike[k] >= _SURELY_ALIKE:
             yield _Verdict(False, 0.0)
         else:
@@ -211,8 +245,8 @@ def _verdicts(
             moved = shift > _MOVED and best > _ALIKE and best - alike[k] > _GAIN
             edges, directions = zip(_edges(windows1[k]), _edges(windows2[k]), strict=True)
             unlike = alike[k] < UNLIKE and max(edges) > contrast and max(directions) > _DIRECTED
-            broken = bool(moved or unlike) and _differ_coarsely(windows1[k], windows2[k], near[k], contrast)
-            yield _Verdict(broken, (shift if moved else math.nan) if broken else 0.0)
+            misfit = bool(moved or unlike) and _differ_coarsely(windows1[k], windows2[k], near[k], contrast)
+            yield _Verdict(misfit, (shift if moved else math.nan) if misfit else 0.0)
 
 
 def _looked_up(mask: BoolArray, box: Box, whole: IntArray) -> BoolArray:
@@ -297,26 +331,24 @@ def _edges(window: Float32Array) -> tuple[float, float]:
     return float(np.quantile(np.hypot(x, y), 0.9)), math.hypot(xx - yy, 2.0 * xy) / max(xx + yy, 1e-9)
 
 
-def _breaks(
-    images: IntArray, places: FloatArray, broken: BoolArray, size: FloatArray, unit: float
-) -> tuple[SeamBreak, ...]:
-    """Broken places of one border that follow each other, as one."""
-    chosen = np.flatnonzero(broken)
-    if not len(chosen):
-        return ()
-    at, pairs = places[chosen], images[chosen]
-    near = spatial.cKDTree(at).query_pairs(2.2 * _STEP, output_type="ndarray")
+def _runs(images: IntArray, places: FloatArray, chosen: BoolArray) -> list[IntArray]:
+    """Indices of the places of one border that were chosen and follow each other."""
+    indices = np.flatnonzero(chosen)
+    if not len(indices):
+        return []
+    at, pairs = places[indices], images[indices]
+    near = spatial.cKDTree(at).query_pairs(_NEXT, output_type="ndarray")
     one, two = near[(pairs[near] == pairs[near[:, :1]]).all(axis=(1, 2))].T
     graph = sparse.coo_array((np.ones(len(one)), (one, two)), shape=(len(at),) * 2)
     _, group = csgraph.connected_components(graph, directed=False)
-    breaks = []
-    for members in np.split(np.argsort(group, kind="stable"), np.cumsum(np.bincount(group))[:-1]):
-        length = float(np.hypot(*np.ptp(at[members], axis=0))) + _STEP
-        middle = at[members][np.argmin(np.hypot(*(at[members] - at[members].mean(axis=0)).T))]
-        known = size[chosen][members]
-        known = known[np.isfinite(known)]
-        x, y = ((middle + 0.5) * unit - 0.5).tolist()
-        i, j = pairs[members][0].tolist()
-        shift = float(np.median(known)) * unit if len(known) else math.nan
-        breaks.append(SeamBreak((i, j), (x, y), length * unit, shift))
-    return tuple(sorted(breaks, key=lambda one: -one.length))
+    return np.split(indices[np.argsort(group, kind="stable")], np.cumsum(np.bincount(group))[:-1])
+
+
+def _stretch(images: IntArray, places: FloatArray, shift: FloatArray, run: IntArray, unit: float) -> SeamBreak:
+    """Places of one border that follow each other, as one."""
+    at, known = places[run], shift[run][np.isfinite(shift[run])]
+    middle = at[np.argmin(np.hypot(*(at - at.mean(axis=0)).T))]
+    i, j = images[run[0]].tolist()
+    x, y = ((middle + 0.5) * unit - 0.5).tolist()
+    length = float(np.hypot(*np.ptp(at, axis=0))) + _STEP
+    return SeamBreak((i, j), (x, y), length * unit, float(np.median(known)) * unit if len(known) else math.nan)

@@ -148,7 +148,7 @@ def _other_surface(
 ) -> CandidateLayout | None:
     """By the second motion of the images whose seams break; None where no more of them looks alike then."""
     used = np.flatnonzero(registration.alignment.used).tolist()
-    broken = [(used[one.images[0]], used[one.images[1]]) for one in first.seams.breaks]
+    broken = [(used[one.images[0]], used[one.images[1]]) for one in first.seams.misfits]
     other = by_second_motions(registration, broken, aligner)
     if other is None or not _joins(other, registration, _MISFIT * _error(registration)):
         return None
@@ -163,7 +163,7 @@ def _least_broken(tried: Sequence[CandidateLayout], given: CandidateLayout | Lim
     """The layout that the least speaks against; the one that was given unless another is clearly better."""
     first = tried[0]
     best = min((one for one in tried if one.clipped <= first.clipped), key=lambda one: (one.faults, one.broken))
-    broken = first.broken if first.seams.seen else 0
+    broken = 0 if first.seams.fit else first.broken
     clearly = best.faults < first.faults or best.broken <= _CLEARLY * broken
     return best if clearly or isinstance(given, LimitError) else first
 

@@ -43,12 +43,12 @@ class CandidateLayout:
 
     @cached_property
     def faults(self) -> int:
-        """What speaks against it: broken seams, stretched places, overlaps that do not look alike, and local alignment
-        whose seams lie nowhere where they could be judged, 0 to 4.
+        """What speaks against it: seams that do not fit, stretched places, overlaps that do not look alike, and local
+        alignment whose seams lie nowhere where they could be judged, 0 to 4.
         """
         seams = self.seams
         unjudged = bool(self.local.fields) and not len(seams.places)
-        return int(seams.seen) + int(is_stretched(self.plan)) + int(seams.contradicted) + int(unjudged)
+        return int(not seams.fit) + int(is_stretched(self.plan)) + int(seams.contradicted) + int(unjudged)
 
     @property
     def clipped(self) -> int:
@@ -57,8 +57,8 @@ class CandidateLayout:
 
     @property
     def broken(self) -> int:
-        """Number of places at which its seams are broken; they are as far apart in every layout."""
-        return int(self.seams.broken.sum())
+        """Number of places at which its seams do not fit; they are as far apart in every layout."""
+        return int(self.seams.misfit.sum())
 
 
 def straight_edges(source: Source) -> FloatArray:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from rdstitch.compositing import Canvas, CompositeOptions, SeamQuality
+from rdstitch.compositing import Canvas, CompositeOptions, SeamBreak, SeamQuality
 from rdstitch.compositing.projection import PLANE
 from rdstitch.georeferencing.georeference import Georeference, check_summary, map_summary
 from rdstitch.inputs.source import Source
@@ -62,7 +62,7 @@ def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
     """Where seams are broken, a warning where a person sees it, else a detail; of overlaps that are unlike, one warning
     where no seams hold that say otherwise.
     """
-    hold = len(seams.places) and not seams.seen
+    hold = len(seams.places) and seams.fit
     if seams.contradicted and not hold and seams.least_alike is not None:
         images = tuple(paths[k] for k in seams.least_alike)
         text = (
@@ -73,7 +73,10 @@ def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
         return [Message(text, images, code="rival-motion")]
     if not seams.breaks:
         return []
-    worst = list({one.images: one for one in reversed(seams.breaks)}.values())[::-1][:MAX_NAMED]
+    longest: dict[tuple[int, int], SeamBreak] = {}
+    for one in seams.breaks:
+        longest.setdefault(one.images, one)
+    worst = list(longest.values())[:MAX_NAMED]
     breaks = []
     for one in worst:
         (x, y), (first, second) = one.position, names_of(paths[k] for k in one.images)

@@ -271,7 +271,7 @@ def test_tiles_in_a_folder_are_not_called_too_large_and_pairs_are_looked_through
 def test_the_dots_of_a_thousand_seams_are_as_many_as_can_be_told_apart_and_hide_no_break() -> None:
     places = np.stack(np.meshgrid(np.arange(0, 20_000, 8.0), np.arange(0, 10_000, 100.0)), axis=-1).reshape(-1, 2)
     broken = np.arange(len(places)) == 123_456
-    dots = seam_dots(SeamQuality(places, broken, spacing=8.0), 0.06, 12.0)
+    dots = seam_dots(SeamQuality(places, broken=broken, spacing=8.0), 0.06, 12.0)
     assert len(dots) <= 5000
     ((x, y, _),) = [dot for dot in dots if dot[2]]
     np.testing.assert_allclose((x, y), (places[broken][0] + 0.5) * 0.06)

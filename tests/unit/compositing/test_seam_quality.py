@@ -14,6 +14,9 @@ from rdstitch.synthetic.textures import ground
 SIZE = (400, 300)
 SCENE = ground((600, 500), seed=3, channels=1).region(0, 0, 600, 500)[..., 0].astype(np.float32)
 SCENE *= np.float32(255.0 / SCENE.max())
+PLANKS = SCENE.copy()  # the same with lines that somebody follows
+for height in range(-100, 500, 50):
+    cv2.line(PLANKS, (0, height), (599, height + 60), (235.0,), 7, cv2.LINE_AA)
 LABELS = np.repeat((np.arange(SIZE[0]) >= 200).astype(np.int32)[None], SIZE[1], axis=0)
 
 
@@ -23,18 +26,20 @@ def _tile(pixels: Float32Array, box: Box) -> SeamTile:
 
 def _quality(second: Float32Array, *, label_size: float = 1.0, unit: float = 1.0) -> SeamQuality:
     """Two images on 400 x 300 pixels, the first on the left of x = 200."""
-    first = _tile(SCENE[: SIZE[1], : SIZE[0]], (0, 0, *SIZE))
+    first = _tile(PLANKS[: SIZE[1], : SIZE[0]], (0, 0, *SIZE))
     columns, rows = (round(n / label_size) for n in SIZE)
     labels = np.zeros((rows, columns), dtype=np.int32)
     labels[:, columns // 2 :] = 1
     return measure_seams([first, _tile(second, (0, 0, *SIZE))], labels, label_size, unit)
 
 
-def _shifted(right: int, down: int, within: tuple[int, int] = (0, SIZE[1])) -> Float32Array:
-    """The scene, whose rows within a range are shifted."""
-    pixels = SCENE[: SIZE[1], : SIZE[0]].copy()
+def _shifted(
+    right: int, down: int, within: tuple[int, int] = (0, SIZE[1]), scene: Float32Array = PLANKS
+) -> Float32Array:
+    """A scene, whose rows within a range are shifted."""
+    pixels = scene[: SIZE[1], : SIZE[0]].copy()
     top, bottom = within
-    pixels[top:bottom] = np.roll(SCENE, (down, right), (0, 1))[top:bottom, : SIZE[0]]
+    pixels[top:bottom] = np.roll(scene, (down, right), (0, 1))[top:bottom, : SIZE[0]]
     return pixels
 
 
@@ -94,7 +99,7 @@ def test_how_alike_overlaps_look_what_that_fills_and_the_pair_that_does_so_the_l
     """A tile elsewhere on the canvas, and one of which a third shows something else."""
     whole = _tile(SCENE[: SIZE[1], : SIZE[0]], (0, 0, *SIZE))
     beside = _tile(SCENE[: SIZE[1], 101:501], (101, 0, 501, 300))
-    third = _tile(_shifted(50, 70, (200, 300)), (0, 0, *SIZE))
+    third = _tile(_shifted(50, 70, (200, 300), SCENE), (0, 0, *SIZE))
     assert likeness([whole, beside, None], np.array([[1, 0], [2, 0]])) == (1.0, 1.0, (0, 1))
     found = likeness([whole, beside, third], np.array([[1, 0], [2, 0]]))
     assert found.alike == pytest.approx((299 + 400 * 2 / 3) / 699, abs=0.06)
@@ -109,7 +114,9 @@ def test_how_alike_overlaps_look_what_that_fills_and_the_pair_that_does_so_the_l
     ("right", "down", "by_chance"), [(0, 0, False), (3, 2, False), (37, 20, True), (-60, 45, True)]
 )
 def test_images_that_are_put_anywhere_are_alike_by_chance(right: int, down: int, by_chance: bool) -> None:
-    tiles = [_tile(pixels, (0, 0, *SIZE)) for pixels in (_shifted(0, 0), _shifted(right, down))]
+    tiles = [
+        _tile(pixels, (0, 0, *SIZE)) for pixels in (_shifted(0, 0, scene=SCENE), _shifted(right, down, scene=SCENE))
+    ]
     quality = SeamQuality(alike=likeness(tiles, np.array([[1, 0]])).alike)
     assert (quality.by_chance, quality.contradicted) == (by_chance, by_chance)
 
@@ -124,8 +131,32 @@ def test_grass_in_the_wind_is_no_break() -> None:
     assert quality.broken.sum() <= 1
 
 
+def _leaves(rng: np.random.Generator) -> Float32Array:
+    """Foliage and bare twigs: blobs and strokes of all directions, none longer than 20 pixels."""
+    pixels: Float32Array = np.full((500, 600), 150.0, dtype=np.float32)
+    for x, y, turn, level in zip(*rng.uniform((0, 0, 0, 40), (600, 500, np.pi, 240), (6000, 4)).T, strict=True):
+        half = 8.0 * np.array([np.cos(turn), np.sin(turn)])
+        start, end = (np.rint((x, y) + sign * half).astype(int).tolist() for sign in (-1, 1))
+        cv2.line(pixels, start, end, level, int(rng.integers(1, 4)), cv2.LINE_AA)
+    return cv2.GaussianBlur(pixels, (0, 0), 1.0).astype(np.float32)
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_twigs_and_pebbles_that_do_not_fit_are_no_break(moved: bool) -> None:
+    """A wind has turned them, or they are nearer than what is behind them; no line ends that somebody would follow."""
+    rng = np.random.default_rng(5)
+    first = _leaves(rng)
+    second = np.roll(first, (9, 4), (0, 1)) if moved else _leaves(rng)
+    tiles = [_tile(image[: SIZE[1], : SIZE[0]], (0, 0, *SIZE)) for image in (first, second)]
+    quality = measure_seams(tiles, LABELS, 1.0, 1.0)
+    assert len(quality.places) > 25
+    assert not quality.fit  # it speaks against a layout all the same
+    assert not quality.seen
+
+
 def test_a_small_output_hides_what_a_large_one_shows() -> None:
-    shown = SeamQuality(np.zeros((20, 2)), np.arange(20) < 8, (SeamBreak((0, 1), (0.0, 0.0), 64.0, 4.0),), spacing=8.0)
+    breaks = (SeamBreak((0, 1), (0.0, 0.0), 64.0, 4.0),)
+    shown = SeamQuality(np.zeros((20, 2)), broken=np.arange(20) < 8, breaks=breaks, spacing=8.0)
     tenth = replace(shown, breaks=(SeamBreak((0, 1), (0.0, 0.0), 6.4, 0.4),), spacing=0.8)
     assert shown.visible
     assert tenth.seen

@@ -120,7 +120,8 @@ def test_a_plane_seen_from_the_sideis_stretched(tilt: float, stretched: bool) ->
 
 
 def _quality(*breaks: SeamBreak, alike: float = 0.9) -> SeamQuality:
-    return SeamQuality(np.zeros((100, 2)), np.arange(100) < len(breaks), breaks, 8.0, alike, least_alike=(0, 2))
+    broken = np.arange(100) < len(breaks)
+    return SeamQuality(np.zeros((100, 2)), broken, broken, breaks, breaks, 8.0, alike, least_alike=(0, 2))
 
 
 def _break(pair: tuple[int, int], length: float) -> SeamBreak:
@@ -132,10 +133,10 @@ def test_a_break_that_a_person_sees_is_one_warning_and_others_a_detail() -> None
     assert seam_messages(_quality(), paths) == []
     (detail,) = seam_messages(_quality(_break((0, 1), 44.0)), paths)
     assert detail.severity == "detail"
-    (warning,) = seam_messages(_quality(_break((1, 2), 46.0), _break((1, 2), 30.0), _break((0, 1), 9.0)), paths)
+    (warning,) = seam_messages(_quality(_break((1, 2), 46.0), _break((0, 1), 30.0), _break((1, 2), 9.0)), paths)
     assert warning.severity == "warning"
     assert warning.images == ("in/b.jpg", "in/c.jpg", "in/a.jpg")
-    assert "a break of 46 pixels at (10, 20), between b.jpg and c.jpg; a break of 9 pixels" in warning.text
+    assert "a break of 46 pixels at (10, 20), between b.jpg and c.jpg; a break of 30 pixels" in warning.text
     assert "and 1 more" in warning.text
     for nothing_holds in (_quality(_break((1, 2), 46.0), alike=0.49), SeamQuality(alike=0.49, least_alike=(0, 2))):
         (unlike,) = seam_messages(nothing_holds, paths)
