@@ -132,7 +132,7 @@ def _decide_exposure(task: _Task, survey: Survey) -> tuple[Exposure, list[Messag
     if method == "exif":
         exposure, message = exposure_by_metadata(task.images, task.reader.samples[0])
         return exposure, [message]
-    return estimate_exposure(survey, task.images, method), []
+    return estimate_exposure(survey, task.images, method, task.plan.workers), []
 
 
 def _decide_seams(task: _Task, survey: Survey, exposure: Exposure) -> tuple[SeamMap, SeamQuality]:

@@ -142,7 +142,7 @@ class Aligner:
         The model is that of fewer pairs, if it is ``known`` and the others agree with it.
         """
         return_freed_memory()
-        aligned = self._drafted(pairs, known=known)
+        aligned = self._drafted(pairs, known)
         ground = over_rough_ground(pairs, self.threshold)
         if ground is not pairs and not self._explains(aligned.alignment, pairs, ground):
             over = self._drafted(ground)
@@ -177,8 +177,8 @@ class Aligner:
     def _drafted(
         self,
         pairs: Sequence[PairRegistration],
-        counted: frozenset[int] = frozenset(),
         known: KnownModel | None = None,
+        counted: frozenset[int] = frozenset(),
     ) -> AlignedPairs:
         """The images aligned; near copies are placed afterwards, but for those that are ``counted`` as all are."""
         if not any(pair.relation for pair in pairs):
@@ -197,7 +197,7 @@ class Aligner:
         found, known = self._recalled("draft", task, lambda: (task.draft, task.found))
         draft = complete(found)
         if misfits := self._misfits(draft, distinct):
-            with_them = self._drafted(pairs, counted | misfits)
+            with_them = self._drafted(pairs, counted=counted | misfits)
             if with_them.alignment.model != draft.model:  # so little new ground tells of motion, but not of the lens
                 return with_them
 
