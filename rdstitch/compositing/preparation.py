@@ -136,7 +136,7 @@ def _decide_exposure(task: _Task, survey: Survey) -> tuple[Exposure, list[Messag
 
 
 def _decide_seams(task: _Task, survey: Survey, exposure: Exposure) -> tuple[SeamMap, SeamQuality]:
-    seams = find_seams(survey, exposure, task.options.seam == "graphcut")
+    seams = find_seams(survey, exposure, task.options.seam == "graphcut", task.plan.workers)
     quality = survey.seam_quality(seams.labels)
     if task.canvas.period is not None:
         seams = seams.repeated(round(task.canvas.period))

@@ -6,9 +6,8 @@ program reads the first page. Where there are overviews, the file is in the orde
 (:mod:`rdstitch.io.tiff_order`).
 """
 
-from collections import deque
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from rdstitch.io.samples import as_alpha
 from rdstitch.io.strips import ImageSpec, Strip, with_alpha
 from rdstitch.io.tiff_order import put_in_order
 from rdstitch.results.messages import Message
+from rdstitch.system.ahead import in_order_ahead
 from rdstitch.system.late_imports import imagecodecs, tifffile
 
 TILE = 256  # side, pixels
@@ -208,13 +208,7 @@ def _encoded(tiles: Iterable[NDArray[Any]], pool: ThreadPoolExecutor, workers: i
     if workers == 1:
         yield from map(encoded_tile, tiles)
         return
-    under_way = deque[Future[bytes]]()
-    for tile in tiles:
-        under_way.append(pool.submit(encoded_tile, tile))
-        if len(under_way) > _AHEAD * workers:
-            yield under_way.popleft().result()
-    while under_way:
-        yield under_way.popleft().result()
+    yield from in_order_ahead(pool, encoded_tile, tiles, _AHEAD * workers)
 
 
 def encoded_tile(tile: NDArray[Any]) -> bytes:

@@ -18,6 +18,7 @@ from rdstitch.compositing.gain_compensation import estimate_exposure
 from rdstitch.compositing.gain_fit import Differences, fit_gain_and_vignetting
 from rdstitch.compositing.overlap_cells import compare_overlaps
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure
+from rdstitch.compositing.seam_finder import find_seams
 from rdstitch.compositing.source_images import ImageReader, PlacedImage
 from rdstitch.compositing.static_pixels import static_pixels
 from rdstitch.compositing.survey import Survey, survey_images
@@ -388,3 +389,11 @@ def test_a_block_over_half_of_what_a_darker_shot_shares_tints_nothing() -> None:
     found = side_by_side(frames, places, blend="none").pixels.astype(int)
     clean = _paper_in(sheet, 255, found.shape) & (np.abs(found - block).max(axis=2) > 60) & (found.max(axis=2) > 0)
     assert (found[clean].min(axis=1) >= 247).all()
+
+
+def test_seams_are_the_same_by_any_number_of_threads() -> None:
+    survey, images = _row(8)
+    exposure = estimate_exposure(survey, images)
+    one, several = (find_seams(survey, exposure, graphcut=True, workers=workers).labels for workers in (1, 3))
+    assert set(np.unique(one).tolist()) >= set(range(8))
+    np.testing.assert_array_equal(one, several)
