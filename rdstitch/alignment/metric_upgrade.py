@@ -52,11 +52,13 @@ def _cost(relative: FloatArray, tilts: FloatArray, log_focal: float) -> FloatArr
     costs = []
     for block in np.array_split(tilts, min(math.ceil(len(tilts) * len(relative) / _AT_ONCE), len(tilts))):
         metric = _metric(relative, block, log_focal)
-        a, b = metric[..., 0], metric[..., 1]
-        aa, bb, ab = ((p * q).sum(axis=-1) for p, q in ((a, a), (b, b), (a, b)))
+        # By coordinate: sums and cross products along an axis of three take most of the time otherwise.
+        a, b, c = np.ascontiguousarray(np.moveaxis(metric, (3, 2), (0, 1)))
+        aa, bb, ab = (p[0] * q[0] + p[1] * q[1] + p[2] * q[2] for p, q in ((a, a), (b, b), (a, b)))
         error = ((aa - bb) ** 2 + (2.0 * ab) ** 2) / np.maximum(aa + bb, 1e-300) ** 2
-        behind = (metric[..., 2] * np.cross(a, b)).sum(axis=-1) <= 0.0
-        costs.append(np.where(behind, _OUTLYING**2, np.minimum(error, _OUTLYING**2)).mean(axis=1))
+        across = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        front = c[0] * across[0] + c[1] * across[1] + c[2] * across[2]
+        costs.append(np.where(front <= 0.0, _OUTLYING**2, np.minimum(error, _OUTLYING**2)).mean(axis=1))
     return np.concatenate(costs)
 
 
@@ -64,8 +66,9 @@ def _metric(relative: FloatArray, tilts: FloatArray, log_focal: float) -> FloatA
     """``diag(f, f, 1)⁻¹ G_i diag(f, f, 1) R`` (T, N, 3, 3) for tilts (T, 2) of the reference."""
     calibration = np.exp([log_focal, log_focal, 0.0])
     normalized = relative / calibration[:, None] * calibration
-    product: FloatArray = normalized[None] @ rotation_from_tilt(tilts)[:, None]
-    return product
+    # One product of two matrices: one for each tilt and image takes ten times as long.
+    product = normalized.reshape(-1, 3) @ np.moveaxis(rotation_from_tilt(tilts), 0, 1).reshape(3, -1)
+    return product.reshape(-1, 3, len(tilts), 3).transpose(2, 0, 1, 3)
 
 
 def _decomposed(relative: FloatArray, tilt: FloatArray, log_focal: float) -> tuple[FloatArray, FloatArray]:

@@ -11,6 +11,7 @@ from rdstitch.alignment.alignment_options import FEWEST_MATCHES, AlignmentOption
 from rdstitch.alignment.build_result import AdjustedImages, build_alignment
 from rdstitch.alignment.cycle_consistency import cycle_consistency, misfitting_links
 from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_strained
+from rdstitch.alignment.known_model import KnownModel
 from rdstitch.alignment.least_squares.bundle_adjustment import FEW_GAIN, MIN_GAIN
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import CameraPriors
@@ -58,6 +59,8 @@ def align(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOp
 class AlignmentTask(GivenImages):
     """Alignment of some images: a draft, and the result, each computed when it is wanted."""
 
+    known: KnownModel | None = None  # of these images by fewer links, which the others agree with
+
     @cached_property
     def draft(self) -> Alignment:
         """Model, lens and poses by a few matches of each link; deviations are those of the normal equations."""
@@ -68,10 +71,15 @@ class AlignmentTask(GivenImages):
         """Adjusted to all matches."""
         return _with_checked_focal(_adjusted(self._selected), self.options)
 
+    @property
+    def found(self) -> KnownModel | None:
+        """The model of the draft, for one by more links to start from, if it can."""
+        return KnownModel.of(self._selected)
+
     @cached_property
     def _selected(self) -> AdjustedImages:
         _check(self)
-        return _lens_and_model(self)
+        return _lens_and_model(self, self.known)
 
 
 def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
@@ -85,8 +93,8 @@ def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
     return int(full[np.argmax(np.asarray(trust)[full])])
 
 
-def _lens_and_model(given: GivenImages) -> AdjustedImages:
-    """The lens, the wrong pairs and the model, by as many matches of each link as show them."""
+def _lens_and_model(given: GivenImages, known: KnownModel | None = None) -> AdjustedImages:
+    """The lens, the wrong pairs and the model, unless it is known, by as many matches of each link as show them."""
     priors = given.options.camera_priors(given.cameras)
     all_matches, relations = _observations(
         given.links, given.cameras, _matches_of_a_link(len(given.links), given.options)
@@ -96,7 +104,7 @@ def _lens_and_model(given: GivenImages) -> AdjustedImages:
     distortion = float(lens.pairwise.parameters.lens[0])
     priors = priors.with_lens(distortion)
     wrong, confirmed = cycle_consistency(lens.pairwise, sample, len(given.cameras))
-    all_links = _problem_of_all_links(given, sample, lens, _tree_ranks(sample, confirmed), priors, wrong)
+    all_links = _problem_of_all_links(given, known, sample, lens, _tree_ranks(sample, confirmed), priors, wrong)
     connected, images = all_links.part(~wrong)
     # Data weigh against priors as they will in the final adjustment.
     shared, _ = independent_errors(connected.observations, connected.homographies, connected.lens)
@@ -105,7 +113,8 @@ def _lens_and_model(given: GivenImages) -> AdjustedImages:
     if messages:
         all_links = replace(all_links, camera_priors=options.camera_priors(given.cameras).with_lens(distortion))
         connected, _ = all_links.part(~wrong)
-    choice = select_model(connected, options.models, lens.refinements, options.purpose)
+    choice = None if known is None else known.choice(connected, images)
+    choice = choice or select_model(connected, options.models, lens.refinements, options.purpose)
     aligned, choice, images, wrong = _drop_wrong_pairs(all_links, connected, images, choice, wrong)
     choice = choose_over_relief(aligned, choice, options.models, options.purpose)
     if options.reference is not None and options.reference not in images:
@@ -125,6 +134,7 @@ def _lens_and_model(given: GivenImages) -> AdjustedImages:
 
 def _problem_of_all_links(
     given: GivenImages,
+    known: KnownModel | None,
     sample: Observations,
     lens: LensChoice,
     trust: FloatArray,
@@ -134,6 +144,7 @@ def _problem_of_all_links(
     """The problem of all images, with the reference that was asked for, or else a good one of those not ``wrong``."""
     homographies, start = lens.pairwise.homographies, lens.pairwise.parameters.lens
     count, reference = len(given.cameras), given.options.reference
+    reference = known.reference if reference is None and known is not None else reference
     all_links = Problem(
         sample, homographies, start, lens.free, priors, trust=trust, count=count, fixed=reference, min_gain=FEW_GAIN
     )

@@ -1,13 +1,13 @@
 """Robust least squares over the cells of overlaps, with a prior, in memory that grows with the number of images."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.compositing.overlap_cells import Cells
 from rdstitch.geometry.conjugate_gradients import conjugate_gradients
-from rdstitch.system.late_imports import sparse
+from rdstitch.system.late_imports import sparse, sparse_linalg
 
 VISIBLE = 0.004  # log units, a grey level of a light sample: differences below are as good as none
 DECIMALS = 5  # of solutions, that are kept: far below a grey level
@@ -25,6 +25,8 @@ class Prior(NamedTuple):
     precision: "sparse.csr_array"  # (K, K)
     weighted_mean: FloatArray  # (K, C): what is expected, multiplied by the precision
     block: int  # unknowns of an image
+    # (block, S): shapes of an image's unknowns that are solved for all images at once; None where an image has but one
+    shapes: FloatArray | None = None
 
 
 def fit_robustly(
@@ -34,6 +36,7 @@ def fit_robustly(
     values: FloatArray,
     prior: Prior,
     clipped_weight: float = 0.0,
+    workers: int = 1,
 ) -> tuple[FloatArray, FloatArray]:
     """Solution (K, C) of ``design x = values`` (M, C) and the errors, by iteratively reweighted least squares."""
     errors = values - _modes(values, cells.pair, cells.evidence)
@@ -45,7 +48,7 @@ def fit_robustly(
         scale = max(float(size[order[np.searchsorted(total, _CORE * total[-1])]]) / _CORE_SIGMA, VISIBLE)
         robust = weight * (1.0 - (size / (_TUKEY * scale)) ** 2).clip(0.0) ** 2
         robust[cells.darkened(errors)] = clipped_weight
-        solution = solve(design, robust, values, prior, solution)
+        solution = solve(design, robust, values, prior, solution, workers)
         errors, before = values - design @ solution, errors
         if np.abs(errors - before).max() < VISIBLE:
             break
@@ -79,9 +82,18 @@ def _modes(values: FloatArray, pair: IntArray, evidence: FloatArray) -> FloatArr
 
 
 def solve(
-    design: "sparse.csr_array", weight: FloatArray, values: FloatArray, prior: Prior, start: FloatArray
+    design: "sparse.csr_array",
+    weight: FloatArray,
+    values: FloatArray,
+    prior: Prior,
+    start: FloatArray,
+    workers: int = 1,
 ) -> FloatArray:
-    """Weighted least squares by conjugate gradients, preconditioned by the inverse of the part of each image."""
+    """Weighted least squares by conjugate gradients, preconditioned by the inverse of the part of each image.
+
+    And, of unknowns that vary smoothly over an image, by that of their smooth shapes in all images: what many images
+    have in common goes from each to the next only, step by step, otherwise.
+    """
     weighted = design.copy()
     weighted.data *= np.repeat(weight, np.diff(design.indptr))
     # No larger than the design, whose rows every step would go through twice otherwise.
@@ -94,7 +106,15 @@ def solve(
     blocks[row // block, row % block, column % block] = entries.data[own]
     inverse = np.linalg.inv(blocks)
 
-    def precondition(left: FloatArray) -> FloatArray:
-        return (inverse @ left.reshape(-1, block, left.shape[1])).reshape(left.shape)
+    def of_images(left: FloatArray) -> FloatArray:
+        return np.asarray((inverse @ left.reshape(-1, block, left.shape[1])).reshape(left.shape))
 
-    return conjugate_gradients(normal, right, start, precondition, _TOLERANCE)
+    if prior.shapes is None:
+        return conjugate_gradients(normal, right, start, of_images, _TOLERANCE, workers)
+    smooth: Any = sparse.csr_array(sparse.kron(sparse.eye_array(len(blocks)), prior.shapes))
+    factor: Any = sparse_linalg.splu(sparse.csc_array(smooth.T @ normal @ smooth))
+
+    def of_all(left: FloatArray) -> FloatArray:
+        return np.asarray(of_images(left) + smooth @ factor.solve(smooth.T @ left))
+
+    return conjugate_gradients(normal, right, start, of_all, _TOLERANCE, workers)

@@ -21,24 +21,26 @@ _FIELD_SIGMA, _OWN_SIGMA = 0.3, 0.02
 _RISE_SIGMA, _BEND_SIGMA = 0.1, 0.5
 
 
-def fit_fields(cells: Cells, values: FloatArray, cameras: Sequence[Camera]) -> tuple[FloatArray, FloatArray]:
+def fit_fields(
+    cells: Cells, values: FloatArray, cameras: Sequence[Camera], workers: int = 1
+) -> tuple[FloatArray, FloatArray]:
     """Fields (N, B, B, C) beside gains and vignetting, and the errors (M, C)."""
     side, channels = _field_side(len(cameras)), values.shape[1]
     design = _field_design(cells, cameras, side)
     prior = _field_prior(np.zeros((len(cameras), channels)), side, _FIELD_SIGMA)
     weight = cells.content / _CELL_SIGMA**2
-    fields, errors = fit_robustly(cells, design, weight, values, prior, clipped_weight=_CELL_SIGMA**-2)
+    fields, errors = fit_robustly(cells, design, weight, values, prior, clipped_weight=_CELL_SIGMA**-2, workers=workers)
     return fields.reshape(len(cameras), side, side, channels), errors
 
 
-def fit_own_brightness(cells: Cells, wanted: FloatArray, cameras: Sequence[Camera]) -> FloatArray:
+def fit_own_brightness(cells: Cells, wanted: FloatArray, cameras: Sequence[Camera], workers: int = 1) -> FloatArray:
     """Fields (N, B, B, C) of means ``wanted`` (N, C), that agree in the overlaps."""
     side, channels = _field_side(len(cameras)), wanted.shape[1]
     design = _field_design(cells, cameras, side)
     agree = np.zeros((len(cells.pair), channels))
     start = np.zeros((design.shape[1], channels))
     prior = _field_prior(wanted, side, _OWN_SIGMA)
-    fields = solve(design, np.full(len(agree), _CELL_SIGMA**-2), agree, prior, start)
+    fields = solve(design, np.full(len(agree), _CELL_SIGMA**-2), agree, prior, start, workers)
     return np.round(fields, DECIMALS).reshape(len(cameras), side, side, channels)
 
 
@@ -67,4 +69,10 @@ def _field_prior(wanted: FloatArray, side: int, sigma: float) -> Prior:
         for both in (np.kron(step, one), np.kron(one, step)):
             block += both.T @ both / (change**2 * max(1, len(both)))
     precision = sparse.csr_array(sparse.kron(sparse.eye_array(len(wanted)), block))
-    return Prior(precision, np.repeat(wanted, nodes, axis=0) / (sigma**2 * nodes), nodes)
+    along = np.column_stack([np.ones(side), np.linspace(-1.0, 1.0, side)])
+    return Prior(
+        precision,
+        np.repeat(wanted, nodes, axis=0) / (sigma**2 * nodes),
+        nodes,
+        np.asarray(np.kron(along, along), dtype=np.float64),
+    )

@@ -13,6 +13,7 @@ With "balanced", the whole then follows the brightness of each region's own imag
 
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -35,37 +36,46 @@ _BRIGHTEST_SHARE, _MAX_WHITE = 0.999, KNEE + (1.0 - KNEE) / math.sqrt(0.75)
 _MEDIAN_SAMPLES = 10_000  # of all images together
 
 
-def estimate_exposure(survey: Survey, images: Sequence[PlacedImage], method: ExposureMethod = "balanced") -> Exposure:
+def estimate_exposure(
+    survey: Survey, images: Sequence[PlacedImage], method: ExposureMethod = "balanced", workers: int = 1
+) -> Exposure:
     """Estimate what makes images agree where they overlap, with the median brightness of the set kept.
 
     The distortion centre is the centre of the vignetting, and the exposure that the camera wrote down is a weak prior
-    of the gain. Nothing is corrected where that makes images agree no better.
+    of the gain. Nothing is corrected where that makes images agree no better. ``workers``: threads.
     """
-    present, cells = [tile for tile in survey.tiles if tile is not None], compare_overlaps(survey)
+    present, cells = [tile for tile in survey.tiles if tile is not None], compare_overlaps(survey, workers)
     integer = any(tile.pixels.dtype.kind == "u" for tile in present)
     if cells is None or not cells.evidence.any():
         return no_exposure(len(images), present[0].pixels.shape[2] if present else 1)
-    responses = [Differences.of(cells, b) for b in ((_SRGB_OFFSET, 0.0) if integer else (0.0,))]
-    fits = [(*fit_gain_and_vignetting(data, images), data) for data in responses]
+
+    def fitted(offset: float) -> tuple[Exposure, FloatArray, Differences]:
+        data = Differences.of(cells, offset)
+        return (*fit_gain_and_vignetting(data, images), data)
+
+    with ThreadPoolExecutor(workers) as pool:
+        fits = list(pool.map(fitted, (_SRGB_OFFSET, 0.0) if integer else (0.0,)))
     exposure, errors, data = min(fits, key=lambda fit: fit[0].rms_after)
     if exposure.rms_after > (1.0 - MIN_RELATIVE_GAIN) * exposure.rms_before:
         same = no_exposure(*exposure.log_gain.shape)
         exposure, errors = replace(same, offset=data.offset, rms_before=exposure.rms_before), data.values
     cameras = [image.camera for image in images]
     if method != "gain":
-        fields, left = fit_fields(cells, errors, cameras)
+        fields, left = fit_fields(cells, errors, cameras, workers)
         shown = np.where(cells.darkened(errors), 1.0, cells.content)
         if data.misfit(left, shown) < (1.0 - MIN_RELATIVE_GAIN) * data.misfit(errors, shown):
             exposure = replace(exposure, fields=fields, rms_after=data.misfit(left))
     if not (exposure.log_gain.any() or exposure.fields.size):
         return no_exposure(*exposure.log_gain.shape)
     if method == "balanced" and integer:
-        exposure = _without_burning(exposure, cells, survey, cameras)
+        exposure = _without_burning(exposure, cells, survey, cameras, workers)
     light, log = _samples(exposure, survey, cameras)
     return replace(exposure, log_gain=exposure.log_gain + _common(light, log))
 
 
-def _without_burning(exposure: Exposure, cells: Cells, survey: Survey, cameras: Sequence[Camera]) -> Exposure:
+def _without_burning(
+    exposure: Exposure, cells: Cells, survey: Survey, cameras: Sequence[Camera], workers: int
+) -> Exposure:
     """With images that follow their own brightness just as far as it takes to leave contrast in what is bright."""
     light, log = _samples(exposure, survey, cameras)
     unclipped = light.max(axis=1) < BRIGHTEST + exposure.offset
@@ -78,7 +88,7 @@ def _without_burning(exposure: Exposure, cells: Cells, survey: Survey, cameras: 
         return replace(exposure, white=max(brightest, 1.0))
     # What one image alone is brighter by is to vanish: neighbours count by the share that they have in common.
     around, gains = cells.overlap + sparse.eye_array(len(cameras)), exposure.log_gain + _common(light, log)
-    own = fit_own_brightness(cells, -(around @ gains) / around.sum(axis=1)[:, None], cameras)
+    own = fit_own_brightness(cells, -(around @ gains) / around.sum(axis=1)[:, None], cameras, workers)
     own_alone = replace(exposure, log_gain=np.zeros(gains.shape), vignetting=np.zeros(3), fields=own)
     _, along = _samples(own_alone, survey, cameras)
     share = next((s for s in np.linspace(0.0, 1.0, 17)[1:-1] if white(log + s * along) <= _MAX_WHITE), 1.0)

@@ -1,6 +1,7 @@
 """What two images show of the same ground, as means of small cells: the measurements of gain compensation."""
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any, NamedTuple, Self
@@ -17,6 +18,7 @@ from rdstitch.system.late_imports import sparse
 # Along the longest side of an image or an overlap, and of all overlaps together: of thousands, each needs fewer.
 _CELLS, _MAX_CELLS = 16, 150_000
 _CLIPPED, _MOMENTS = 4, 5  # means of a cell after those of its samples: see _cells_of_overlap
+_PAIRS_AT_A_TIME = 64  # that a thread compares: tens of milliseconds of work
 _SAMPLES = 10  # pixels along each side of a cell that are looked at, at least, where it has so many
 # Integer samples outside this part of the range are clipped or mostly noise.
 _DARKEST, BRIGHTEST = 0.02, 0.97
@@ -76,17 +78,26 @@ class _Shown(NamedTuple):
         return cls(tile, _light(tile), _grey(tile.pixels), int(np.count_nonzero(tile.inside)))
 
 
-def compare_overlaps(survey: Survey) -> Cells | None:
-    """Compare all images that lie over each other; None where no two show the same."""
+def compare_overlaps(survey: Survey, workers: int = 1) -> Cells | None:
+    """Compare all images that lie over each other, by so many threads; None where no two show the same."""
     pairs, count = survey.pairs(), len(survey.tiles)
     shown = {k: _Shown.of(tile) for k, tile in enumerate(survey.tiles) if tile is not None}
-    shares, found = np.zeros(len(pairs)), []
-    for index, (i, j) in enumerate(pairs.tolist()):
-        _, _, box, seen = survey.overlap(i, j)
-        shares[index] = np.count_nonzero(seen) / min(shown[i].area, shown[j].area)
-        for middles, means in _cells_of_overlap(shown[i], shown[j], box):
-            every = max(1, -(-len(means) * len(pairs) // _MAX_CELLS))
-            found.append((np.full(len(means[::every]), index), middles[::every], means[::every]))
+    shares, found = np.zeros(len(pairs)), list[tuple[IntArray, FloatArray, FloatArray]]()
+
+    def compared(first: int) -> list[tuple[IntArray, FloatArray, FloatArray]]:
+        """The cells of some pairs."""
+        of_pairs = []
+        for index, (i, j) in enumerate(pairs[first : first + _PAIRS_AT_A_TIME].tolist(), start=first):
+            _, _, box, seen = survey.overlap(i, j)
+            shares[index] = np.count_nonzero(seen) / min(shown[i].area, shown[j].area)
+            for middles, means in _cells_of_overlap(shown[i], shown[j], box):
+                every = max(1, -(-len(means) * len(pairs) // _MAX_CELLS))
+                of_pairs.append((np.full(len(means[::every]), index), middles[::every], means[::every]))
+        return of_pairs
+
+    with ThreadPoolExecutor(workers) as pool:
+        for of_pairs in pool.map(compared, range(0, len(pairs), _PAIRS_AT_A_TIME)):
+            found += of_pairs
     if not any(len(of_pair) for of_pair, _, _ in found):
         return None
     pair, middles, means = (np.concatenate(each) for each in zip(*found, strict=True))

@@ -132,11 +132,11 @@ def _decide_exposure(task: _Task, survey: Survey) -> tuple[Exposure, list[Messag
     if method == "exif":
         exposure, message = exposure_by_metadata(task.images, task.reader.samples[0])
         return exposure, [message]
-    return estimate_exposure(survey, task.images, method), []
+    return estimate_exposure(survey, task.images, method, task.plan.workers), []
 
 
 def _decide_seams(task: _Task, survey: Survey, exposure: Exposure) -> tuple[SeamMap, SeamQuality]:
-    seams = find_seams(survey, exposure, task.options.seam == "graphcut")
+    seams = find_seams(survey, exposure, task.options.seam == "graphcut", task.plan.workers)
     quality = survey.seam_quality(seams.labels)
     if task.canvas.period is not None:
         seams = seams.repeated(round(task.canvas.period))

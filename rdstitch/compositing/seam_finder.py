@@ -7,7 +7,9 @@ other, so that memory is that of one label per pixel of the reduced canvas.
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -17,9 +19,10 @@ from numpy.typing import NDArray
 from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.resample import border_weight
-from rdstitch.compositing.survey import Survey
+from rdstitch.compositing.survey import Survey, SurveyTile
 from rdstitch.compositing.warp import locate
 from rdstitch.io.reduction import block_mean
+from rdstitch.system.ahead import in_order_ahead
 
 NO_OWNER = -1
 
@@ -27,6 +30,7 @@ NO_OWNER = -1
 # brightness: where nothing differs, a seam keeps to the middle, and what moves is gone round on either side.
 _MIN_SHARE, _MAX_SHARE, _ASIDE = 0.1, 0.9, 0.04
 _AROUND_FREE = 2
+_AHEAD = 4  # images that are prepared before their cuts
 # What a difference of edges, a pixel, counts beside one of brightness, and the root of the largest cost of a pixel, in
 # that of the length of a seam; OpenCV's cut keeps to what it must separate up to a cost of 10,000.
 _EDGES, _VISIBLE = 2.0, 64.0
@@ -98,28 +102,27 @@ class SeamMap:
         return self.labels[np.ix_(rows, columns)]
 
 
-def find_seams(survey: Survey, exposure: Exposure, graphcut: bool) -> SeamMap:
+def find_seams(survey: Survey, exposure: Exposure, graphcut: bool, workers: int = 1) -> SeamMap:
     """Owner of every pixel.
 
-    Seams avoid what differs but for exposure, or, without ``graphcut``, run where borders are equally far.
+    Seams avoid what differs but for exposure, or, without ``graphcut``, run where borders are equally far. One of
+    several ``workers`` prepares the next images beside the cuts, which follow each other.
     """
     width, height = survey.canvas.size
     labels = np.full((height, width), NO_OWNER, dtype=np.int32)
     weights = np.zeros((height, width), dtype=np.float32)
     shown = next((tile.pixels for tile in survey.tiles if tile is not None), np.zeros((0, 0, 1), np.uint8))
     composite = np.zeros((height, width, shown.shape[2]), dtype=shown.dtype) if graphcut else None
-    for index, tile in enumerate(survey.tiles):
-        if tile is not None:
+    prepare = partial(_prepared, survey, exposure if graphcut else None)
+    images = [index for index, tile in enumerate(survey.tiles) if tile is not None]
+    with ThreadPoolExecutor(1) as pool:
+        prepared = map(prepare, images) if workers == 1 else in_order_ahead(pool, prepare, images, _AHEAD)
+        for index, (tile, weight, pixels) in zip(images, prepared, strict=True):
             x0, y0, x1, y1 = tile.box
             cut = np.s_[y0:y1, x0:x1]
-            geometry = locate(survey.warps[index], tile.box)
-            weight = border_weight(geometry)
-            if tile.opacity is not None:
-                weight *= tile.opacity
-            if composite is None:
+            if composite is None or pixels is None:
                 won = tile.inside & (weight > weights[cut])
             else:
-                pixels = exposure.correct(index, geometry, tile.pixels)
                 in_pieces = survey.canvas.period is not None
                 shares = weight / np.maximum(weight + weights[cut], np.float32(1e-12))
                 won = _cut(tile.inside, pixels, composite[cut], labels[cut] != NO_OWNER, shares, in_pieces=in_pieces)
@@ -127,6 +130,19 @@ def find_seams(survey: Survey, exposure: Exposure, graphcut: bool) -> SeamMap:
             labels[cut][won] = index
             weights[cut][won] = weight[won]
     return SeamMap(labels, survey.factor)
+
+
+def _prepared(
+    survey: Survey, exposure: Exposure | None, index: int
+) -> tuple[SurveyTile, Float32Array, NDArray[Any] | None]:
+    """A tile with its border weights, and its samples as exposed alike, if they are wanted."""
+    tile = survey.tiles[index]
+    assert tile is not None
+    geometry = locate(survey.warps[index], tile.box)
+    weight = border_weight(geometry)
+    if tile.opacity is not None:
+        weight *= tile.opacity
+    return tile, weight, None if exposure is None else exposure.correct(index, geometry, tile.pixels)
 
 
 def _cut(

@@ -5,14 +5,14 @@ package with small arguments and results; what is large lies in the cache of the
 """
 
 import sys
-from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
 from typing import TypeVar
 
 from rdstitch.executors.dask_cluster import LOCAL, DaskExecutor
 from rdstitch.executors.processes import ProcessExecutor
+from rdstitch.system.ahead import in_order_ahead
 
 __all__ = ["LOCAL", "DaskExecutor", "ProcessExecutor", "batches", "in_order", "open_executor"]
 
@@ -47,14 +47,4 @@ Result = TypeVar("Result")
 
 def in_order(executor: Executor, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Generator[Result]:
     """The result of each task, in their order; tasks are taken as they are needed."""
-    under_way: deque[Future[Result]] = deque()
-    try:
-        for task in tasks:
-            under_way.append(executor.submit(function, task))
-            if len(under_way) >= _MAX_PENDING:
-                yield under_way.popleft().result()
-        while under_way:
-            yield under_way.popleft().result()
-    finally:
-        for future in under_way:
-            future.cancel()
+    return in_order_ahead(executor, function, tasks, _MAX_PENDING)

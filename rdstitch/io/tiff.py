@@ -7,6 +7,7 @@ program reads the first page. Where there are overviews, the file is in the orde
 """
 
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,11 @@ from rdstitch.io.samples import as_alpha
 from rdstitch.io.strips import ImageSpec, Strip, with_alpha
 from rdstitch.io.tiff_order import put_in_order
 from rdstitch.results.messages import Message
+from rdstitch.system.ahead import in_order_ahead
 from rdstitch.system.late_imports import imagecodecs, tifffile
 
 TILE = 256  # side, pixels
+_AHEAD = 4  # tiles of each thread that are encoded before they are written
 _BUFFER = 2**24  # bytes of tiles that tifffile holds before it writes them; 256 MB by default
 _DEFLATE_LEVEL = 1  # of 1 to 12: 2 takes 1.7 times as long and makes files 2 % smaller
 MIN_OVERVIEW = 256  # pixels along the longer side: smaller images need no overview
@@ -37,19 +40,23 @@ ExtraTag = tuple[int, int, int, Any, bool]
 
 
 def write_tiff(
-    path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = ()
+    path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_tags: Iterable[ExtraTag] = (), workers: int = 1
 ) -> list[Message]:
-    """Write a TIFF file whose first page is the image and whose other pages are its overviews."""
+    """Write a TIFF file whose first page is the image and whose other pages are its overviews; threads encode tiles."""
     sizes = pyramid_sizes(spec.size, MIN_OVERVIEW)
     total = sum(w * h for w, h in sizes) * spec.samples_per_pixel * spec.dtype.itemsize
     joined = (with_alpha(*strip) if spec.transparent else strip[0] for strip in strips)
     mask: list[bytes] | None = [] if _has_mask(spec) else None
-    with tifffile.TiffWriter(path, bigtiff=total > _BIGTIFF_FROM) as tiff:
+    with (
+        tifffile.TiffWriter(path, bigtiff=total > _BIGTIFF_FROM) as tiff,
+        ThreadPoolExecutor(workers) as pool,
+    ):
         for size, passing in pyramid(sizes, joined, path.parent, transparent=spec.transparent):
             kind = 0 if size == spec.size else _REDUCED
             tags = [] if kind else [*copied_tags(spec.metadata), *_band_names(spec), *extra_tags]
             shown = passing if mask is None else _without_alpha(passing, mask)
-            _write_page(tiff, spec, size, shown, tags, kind)
+            encoded = _encoded(tiles_of(shown), pool, workers)
+            _write_page(tiff, spec, size, encoded, tags, kind)
             if mask is not None:
                 _write_mask(tiff, size, mask, kind | _MASK)
                 mask.clear()
@@ -98,11 +105,11 @@ def _write_page(
     tiff: "tifffile.TiffWriter",
     spec: ImageSpec,
     size: tuple[int, int],
-    strips: Iterable[NDArray[Any]],
+    tiles: Iterator[bytes],
     tags: list[ExtraTag],
     kind: int,
 ) -> None:
-    """Write one page from strips that hold all its samples."""
+    """Write one page from all its tiles, as they stand in the file."""
     width, height = size
     transparent = spec.transparent and not _has_mask(spec)
     samples = spec.channels + transparent
@@ -110,7 +117,7 @@ def _write_page(
     extra = ["unspecified"] * (spec.channels - colour) + ["unassalpha"] * transparent
     dpi = None if kind else spec.metadata.resolution
     tiff.write(
-        (encoded_tile(tile) for tile in tiles_of(strips)),
+        tiles,
         shape=(height, width, samples) if samples > 1 else (height, width),
         dtype=spec.dtype,
         photometric="rgb" if colour == 3 else "minisblack",
@@ -191,6 +198,17 @@ def tiles_of(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
 def has_predictor(dtype: np.dtype[Any]) -> bool:
     """Check whether differences of neighbours are stored; what is usual for floating point, few programs can read."""
     return dtype.kind == "u"
+
+
+def _encoded(tiles: Iterable[NDArray[Any]], pool: ThreadPoolExecutor, workers: int) -> Iterator[bytes]:
+    """Tiles as they stand in the file, in their order; threads are a few tiles ahead of whoever takes them.
+
+    The compressor works without Python, beside what makes the next strips.
+    """
+    if workers == 1:
+        yield from map(encoded_tile, tiles)
+        return
+    yield from in_order_ahead(pool, encoded_tile, tiles, _AHEAD * workers)
 
 
 def encoded_tile(tile: NDArray[Any]) -> bytes:

@@ -109,7 +109,7 @@ def _write_file(
         return []
     suffix = Path(name).suffix
     if suffix in _TIFF:
-        return write_tiff(file, spec, strips, extra_tags)
+        return write_tiff(file, spec, strips, extra_tags, workers)
     pieces: Iterable[bytes | memoryview]
     if suffix in _JPEG:
         pieces = jpeg_pieces(spec, strips, workers)

@@ -1,9 +1,8 @@
 """JPEG from strips, whose scans are joined at restart markers, where nothing is carried over."""
 
 import struct
-from collections import deque
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from rdstitch.errors import LimitError
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.strips import ImageSpec, Strip, as_eight_bit
+from rdstitch.system.ahead import in_order_ahead
 
 _ENCODERS = 2  # threads at the most: each has a strip in memory, and keeps up with ten workers that make strips
 _EXIF_HEADER = b"Exif\0\0"
@@ -46,13 +46,7 @@ def _encoded(spec: ImageSpec, strips: Iterable[Strip], workers: int) -> Iterator
         yield from (_jpeg(spec, *strip) for strip in strips)
         return
     with ThreadPoolExecutor(min(workers, _ENCODERS)) as pool:
-        under_way: deque[Future[bytes]] = deque()
-        for strip in strips:
-            under_way.append(pool.submit(_jpeg, spec, *strip))
-            if len(under_way) > _ENCODERS:
-                yield under_way.popleft().result()
-        while under_way:
-            yield under_way.popleft().result()
+        yield from in_order_ahead(pool, lambda strip: _jpeg(spec, *strip), strips, _ENCODERS)
 
 
 def _jpeg(spec: ImageSpec, samples: NDArray[np.generic], alpha: NDArray[np.uint8] | None) -> bytes:

@@ -1,13 +1,16 @@
 """What pairs of images see of λ, of each of their two images on its own."""
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import chain
 from typing import Self
 
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.executors import batches, in_order
 from rdstitch.matching.links import grid_subsample
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust.measurements import Measurements
@@ -34,7 +37,7 @@ class LensVotes:
     covariance: FloatArray  # (L, 2, 2)
 
     @classmethod
-    def of(cls, pairs: Sequence[PairRegistration], threshold: float) -> Self:
+    def of(cls, pairs: Sequence[PairRegistration], threshold: float, executor: Executor) -> Self:
         """The votes of the pairs that see λ; ``threshold``, pixels, as they were estimated with."""
         registered = [
             pair
@@ -43,9 +46,11 @@ class LensVotes:
             and np.isfinite(pair.relation.distortion_std)
             and int(pair.relation.inliers.sum()) >= _MIN_INLIERS
         ]
+        estimate = partial(_per_image_distortions, threshold)
+        votes = chain.from_iterable(in_order(executor, estimate, batches(registered, _PAIRS_AT_ONCE)))
         seen = [
             (pair, vote)
-            for pair, vote in zip(registered, _per_image_distortions(registered, threshold), strict=True)
+            for pair, vote in zip(registered, votes, strict=True)
             if np.isfinite(vote.covariance).all() and vote.coherence < _MAX_COHERENCE
         ]
         return cls(
@@ -96,16 +101,12 @@ class LensVotes:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
-def _per_image_distortions(pairs: Sequence[PairRegistration], threshold: float) -> list[PerImageDistortion]:
+def _per_image_distortions(threshold: float, pairs: Sequence[PairRegistration]) -> list[PerImageDistortion]:
     """λ of both images of each pair, from what lies not too far from where one λ puts it."""
-    estimated: list[PerImageDistortion] = []
-    for start in range(0, len(pairs), _PAIRS_AT_ONCE):
-        block = pairs[start : start + _PAIRS_AT_ONCE]
-        points = [_matches_near_one_lens(pair, threshold) for pair in block]
-        cameras = [(pair.relation.camera, pair.relation.camera2) for pair in block]
-        relations = [pair.relation for pair in block]
-        estimated += estimate_per_image_distortion(relations, Measurements.of_pairs(points, cameras), threshold)
-    return estimated
+    points = [_matches_near_one_lens(pair, threshold) for pair in pairs]
+    cameras = [(pair.relation.camera, pair.relation.camera2) for pair in pairs]
+    relations = [pair.relation for pair in pairs]
+    return estimate_per_image_distortion(relations, Measurements.of_pairs(points, cameras), threshold)
 
 
 def _matches_near_one_lens(pair: PairRegistration, threshold: float) -> tuple[FloatArray, FloatArray]:

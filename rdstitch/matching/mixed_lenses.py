@@ -5,6 +5,7 @@ the images into two lenses predicts what every pair sees.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,14 +70,18 @@ def two_lenses(cameras: Sequence[Camera], votes: LensVotes) -> TwoLenses | None:
 
 
 def separate_lenses(
-    cameras: Sequence[Camera], pairs: Sequence[PairRegistration], threshold: float, known_distortion: float | None
+    cameras: Sequence[Camera],
+    pairs: Sequence[PairRegistration],
+    threshold: float,
+    known_distortion: float | None,
+    executor: Executor,
 ) -> tuple[TwoLenses | None, Mapping[int, str]]:
     """Both lenses, and the images of that which took fewer, or has fewer matches, with why they are left out.
 
     None where one lens will do or λ is known (``known_distortion``); none are left out where it is not clear which
     belong together. ``threshold``: largest transfer error of an inlier, pixels.
     """
-    votes = None if known_distortion is not None else LensVotes.of(pairs, threshold)
+    votes = None if known_distortion is not None else LensVotes.of(pairs, threshold, executor)
     mixed = None if votes is None else two_lenses(cameras, votes)
     if votes is None or mixed is None or not mixed.certain:
         return mixed, {}

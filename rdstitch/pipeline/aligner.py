@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
 from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
+from rdstitch.alignment.known_model import KnownModel
 from rdstitch.alignment.near_copies import without_measurements
 from rdstitch.alignment.result import LinkFit, Unused
 from rdstitch.arrays import FloatArray
@@ -32,6 +33,8 @@ from rdstitch.robust.loss import sigma_of
 from rdstitch.system.cache import Cache
 from rdstitch.system.process_memory import return_freed_memory
 from rdstitch.verification.limits import Limits
+
+Computed = TypeVar("Computed")
 
 _ROUNDS = 2  # of registering more pairs and selecting inliers again at most, each by what the one before has shown
 _SETTLED = 0.05  # share of the inliers that must have changed for the images to be aligned again
@@ -71,6 +74,7 @@ class AlignedPairs:
     alignment: Alignment
     rough: bool = False  # whether the inliers that it was made from are those over rough ground
     completed: Callable[[], Alignment] | None = None  # what the alignment is a draft of; None where it is complete
+    known: KnownModel | None = None  # what a draft by more pairs can start from
 
 
 @dataclass(frozen=True)
@@ -132,10 +136,13 @@ class Aligner:
         """Align the images by the pairs that were registered; from an earlier run where the cache has it."""
         return self.completed(self.draft(pairs))
 
-    def draft(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
-        """Model, lens and poses by a few matches of each pair: what shows which pairs and matches are missing."""
+    def draft(self, pairs: Sequence[PairRegistration], known: KnownModel | None = None) -> AlignedPairs:
+        """Model, lens and poses by a few matches of each pair: what shows which pairs and matches are missing.
+
+        The model is that of fewer pairs, if it is ``known`` and the others agree with it.
+        """
         return_freed_memory()
-        aligned = self._drafted(pairs)
+        aligned = self._drafted(pairs, known)
         ground = over_rough_ground(pairs, self.threshold)
         if ground is not pairs and not self._explains(aligned.alignment, pairs, ground):
             over = self._drafted(ground)
@@ -167,26 +174,37 @@ class Aligner:
         every = np.concatenate(errors)
         return alignment.on_sphere or not len(every) or bool(np.mean(every < self.threshold) > _EXPLAINED)
 
-    def _drafted(self, pairs: Sequence[PairRegistration], counted: frozenset[int] = frozenset()) -> AlignedPairs:
+    def _drafted(
+        self,
+        pairs: Sequence[PairRegistration],
+        known: KnownModel | None = None,
+        counted: frozenset[int] = frozenset(),
+    ) -> AlignedPairs:
         """The images aligned; near copies are placed afterwards, but for those that are ``counted`` as all are."""
         if not any(pair.relation for pair in pairs):
             raise RegistrationError(_no_overlap(self.paths, pairs))
         distinct = self._distinct(pairs, counted)
-        task, compared = self._task(distinct), [distinct.registered[ends].images for ends in distinct.evidence]
+        task = replace(self._task(distinct), known=known)
+        compared = [distinct.registered[ends].images for ends in distinct.evidence]
 
-        def complete(stage: str, compute: Callable[[], Alignment]) -> Alignment:
-            alignment = self._recalled(stage, task, compute)
+        def complete(alignment: Alignment) -> Alignment:
+            alignment = self._upright(alignment, task)
             alignment = alignment.with_copies(distinct.copies, compared)
             alignment = replace(alignment, links=(*alignment.links, *self._links_of_copies(alignment, pairs)))
             twice = {*distinct.copies, *distinct.near_copies}
             return alignment.with_messages([self._counted_once(twice)] if twice else [])
 
-        draft = complete("draft", lambda: task.draft)
+        found, known = self._recalled("draft", task, lambda: (task.draft, task.found))
+        draft = complete(found)
         if misfits := self._misfits(draft, distinct):
-            with_them = self._drafted(pairs, counted | misfits)
+            with_them = self._drafted(pairs, counted=counted | misfits)
             if with_them.alignment.model != draft.model:  # so little new ground tells of motion, but not of the lens
                 return with_them
-        return AlignedPairs(tuple(pairs), draft, completed=lambda: complete("alignment", lambda: task.result))
+
+        def completed() -> Alignment:
+            return complete(self._recalled("alignment", task, lambda: task.result))
+
+        return AlignedPairs(tuple(pairs), draft, completed=completed, known=known)
 
     def _distinct(self, pairs: Sequence[PairRegistration], counted: frozenset[int]) -> _DistinctPairs:
         """Which pairs are evidence; where all images show the same, all are."""
@@ -272,11 +290,14 @@ class Aligner:
         text = f"counted once, because they show almost only what other images show: {names}"
         return Message(text, severity="detail", code="copies")
 
-    def _recalled(self, stage: str, task: AlignmentTask, compute: Callable[[], Alignment]) -> Alignment:
-        """An alignment of the upright images; from an earlier run where the cache has it."""
+    def _recalled(self, stage: str, task: AlignmentTask, compute: Callable[[], Computed]) -> Computed:
+        """What comes of a task; from an earlier run where the cache has it."""
         of_links = (task.links, task.links_of_copies, sorted(task.near_copies.items()))
-        inputs = (task.cameras, self.cache.digest(of_links), task.options)
-        alignment = self.cache.recall(stage, inputs, compute)
+        inputs = (task.cameras, self.cache.digest(of_links), task.options, task.known)
+        return self.cache.recall(stage, inputs, compute)
+
+    def _upright(self, alignment: Alignment, task: AlignmentTask) -> Alignment:
+        """An alignment of the images as they are stored as one of the upright images, each of its own size."""
         sizes = [self._quarters.back.camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
         if any(camera.image_size != size for camera, size in zip(alignment.cameras, sizes, strict=True)):
             alignment = cut_alignment(alignment, sizes)
@@ -320,9 +341,26 @@ def draft_with_loops(
         if selected is None and not any(pair.relation for pair in more):
             return replace(aligned, pairs=pairs)
         estimator.progress("aligning", 0, 1)
+        known = aligned.known if selected is None and _agree(more, aligned, aligner.threshold) else None
         del aligned, alignment, selected  # what a draft was made from takes as much memory as the next one
-        aligned = aligner.draft(pairs)
+        aligned = aligner.draft(pairs, known)
     return aligned
+
+
+def _agree(pairs: Sequence[PairRegistration], aligned: AlignedPairs, threshold: float) -> bool:
+    """Whether registered pairs are where a draft expects them: most matches of each are within ``threshold``, pixels.
+
+    Then they close loops, and tell of its motion and lens no more than what it was made from.
+    """
+    if aligned.rough:
+        return False
+    for pair in (pair for pair in pairs if pair.relation):
+        if not aligned.alignment.used[[*pair.images]].all():
+            return False
+        errors = pair.errors(aligned.alignment.transfer)[pair.relation.inliers]
+        if not np.median(errors) < threshold:
+            return False
+    return True
 
 
 def select_by_whole_lens(aligned: AlignedPairs, threshold: float) -> list[PairRegistration] | None:

@@ -60,7 +60,8 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
     moving = without_static_background(estimator, pairs, candidates)
     estimator, pairs = moving or (estimator, pairs)
     pairs = match_repeated_patterns(estimator, pairs) if purpose.lens_only else pairs
-    mixed, other_lens = separate_lenses(aligner.cameras, pairs, options.threshold, options.known_distortion)
+    given = options.threshold, options.known_distortion
+    mixed, other_lens = separate_lenses(aligner.cameras, pairs, *given, executor)
     progress("aligning", 0, 1)
     pairs = [pair for pair in pairs if not {*pair.images} & other_lens.keys()]
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]

@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 
 from examples.worlds.compositing_scenes import as_image, place_images, render, side_by_side
 from rdstitch.arrays import FloatArray
-from rdstitch.compositing import gain_compensation, overlap_cells, plan_canvas
+from rdstitch.compositing import cell_least_squares, field_fit, gain_compensation, overlap_cells, plan_canvas
 from rdstitch.compositing.boxes import intersection, overlapping_pairs
 from rdstitch.compositing.gain_compensation import estimate_exposure
 from rdstitch.compositing.gain_fit import Differences, fit_gain_and_vignetting
 from rdstitch.compositing.overlap_cells import compare_overlaps
 from rdstitch.compositing.photometric import Exposure, full_scale, no_exposure
+from rdstitch.compositing.seam_finder import find_seams
 from rdstitch.compositing.source_images import ImageReader, PlacedImage
 from rdstitch.compositing.static_pixels import static_pixels
 from rdstitch.compositing.survey import Survey, survey_images
 from rdstitch.compositing.warp import locate, plan_warp
 from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.conjugate_gradients import conjugate_gradients
 from rdstitch.synthetic import ground
 from rdstitch.synthetic.rendering import Photometry
 from tests.sampled import sampled
@@ -86,6 +88,41 @@ def test_gains_of_thousands_of_overlaps_take_a_few_cells_of_each(monkeypatch: py
     cells = compare_overlaps(survey)
     assert 59 <= len(cells.pair) <= 600
     np.testing.assert_allclose(gain_compensation.estimate_exposure(survey, images, "gain").log_gain, of_all, atol=1e-3)
+
+
+def test_exposure_is_the_same_by_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(overlap_cells, "_PAIRS_AT_A_TIME", 3)
+    survey, images = _row(12)
+    one, several = (gain_compensation.estimate_exposure(survey, images, workers=workers) for workers in (1, 3))
+    np.testing.assert_array_equal(one.log_gain, several.log_gain)
+    np.testing.assert_array_equal(one.fields, several.fields)
+
+
+def test_steps_to_the_fields_hardly_grow_with_the_number_of_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What all images of a row have in common need not go from each to the next."""
+    steps = []
+
+    def counted(matrix: Any, right: Any, start: Any, precondition: Any, *rest: Any) -> Any:
+        steps.append(0)
+
+        def once(left: FloatArray) -> Any:
+            steps[-1] += 1
+            return precondition(left)
+
+        return conjugate_gradients(matrix, right, start, once, *rest)
+
+    monkeypatch.setattr(cell_least_squares, "conjugate_gradients", counted)
+    most = []
+    for count in (8, 128):
+        survey, images = _row(count)
+        cells = compare_overlaps(survey)
+        brighter = 0.3 * np.sin(np.linspace(0.0, 2.0 * np.pi, count))[cells.images]
+        steps.clear()
+        field_fit.fit_fields(
+            cells, (brighter[0] - brighter[1])[:, None].repeat(3, axis=1), [image.camera for image in images]
+        )
+        most.append(max(steps))
+    assert most[1] <= 1.5 * most[0]
 
 
 OFFSET, LOG_GAIN, VIGNETTING = 0.04, np.array([[0.0, 0.0, 0.0], [0.2, -0.1, 0.05]]), np.array([-0.3, 0.1, -0.05])
@@ -352,3 +389,11 @@ def test_a_block_over_half_of_what_a_darker_shot_shares_tints_nothing() -> None:
     found = side_by_side(frames, places, blend="none").pixels.astype(int)
     clean = _paper_in(sheet, 255, found.shape) & (np.abs(found - block).max(axis=2) > 60) & (found.max(axis=2) > 0)
     assert (found[clean].min(axis=1) >= 247).all()
+
+
+def test_seams_are_the_same_by_any_number_of_threads() -> None:
+    survey, images = _row(8)
+    exposure = estimate_exposure(survey, images)
+    one, several = (find_seams(survey, exposure, graphcut=True, workers=workers).labels for workers in (1, 3))
+    assert set(np.unique(one).tolist()) >= set(range(8))
+    np.testing.assert_array_equal(one, several)

@@ -106,6 +106,24 @@ def test_same_bytes_every_time(tmp_path: Path, suffix: str, opaque: bool) -> Non
     assert len(written) == 1
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+def test_same_bytes_by_any_number_of_threads(tmp_path: Path, channels: int) -> None:
+    height, width = 700, 1100
+    pixels, alpha = (
+        _image(height, width, channels, np.uint8).reshape(height, width, channels),
+        np.full((height, width), 255, np.uint8),
+    )
+    alpha[:300, 200:] = 0
+    spec = ImageSpec((width, height), channels, pixels.dtype, transparent=True, metadata=Metadata((width, height)))
+    written = []
+    for workers in (1, 3):
+        file = tmp_path / f"{workers}.tif"
+        strips = ((pixels[top : top + 256], alpha[top : top + 256]) for top in range(0, height, 256))
+        write_strips(file, spec, strips, workers=workers)
+        written.append(file.read_bytes())
+    assert written[0] == written[1]
+
+
 def test_other_images_have_another_identity(tmp_path: Path) -> None:
     identities = set()
     for grey in (0, 1):

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 
 from examples.worlds.correspondences import stored
 from rdstitch.arrays import FloatArray
+from rdstitch.executors import ProcessExecutor
 from rdstitch.geometry.camera import Camera
+from rdstitch.matching import lens_votes
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.lens_votes import LensVotes
 from rdstitch.matching.mixed_lenses import TwoLenses, separate_lenses, two_lenses
@@ -23,7 +26,21 @@ LENS = Camera((640, 480), -0.2, focal=520.0)
 def test_few_inliers_have_no_vote(count: int, votes: int) -> None:
     pair = _pair(0, 1, count)
     assert pair.relation.inliers.all()
-    assert len(LensVotes.of([pair], 3.0)) == votes
+    assert len(_voted([pair])) == votes
+
+
+def _voted(pairs: list[PairRegistration], executor: Executor | None = None) -> LensVotes:
+    with executor or ThreadPoolExecutor(1) as opened:
+        return LensVotes.of(pairs, 3.0, opened)
+
+
+def test_votes_are_the_same_by_any_number_of_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lens_votes, "_PAIRS_AT_ONCE", 2)
+    pairs = [_pair(k, k + 1, 40 + k) for k in range(5)]
+    one, several = _voted(pairs), _voted(pairs, ProcessExecutor(2))
+    assert one.image1.tolist() == several.image1.tolist() == [0, 1, 2, 3, 4]
+    np.testing.assert_array_equal(one.distortion, several.distortion)
+    np.testing.assert_array_equal(one.covariance, several.covariance)
 
 
 def _pair(i: int, j: int, count: int, lens1: Camera = LENS, lens2: Camera = LENS) -> PairRegistration:
@@ -42,7 +59,8 @@ def test_images_without_votes_go_with_whichever_lens_is_kept() -> None:
     pairs += [_pair(i, j, 120, second, second) for i, j in ((3, 4), (3, 5), (4, 5))]
     pairs += [_pair(2, 3, 90, first, second), _pair(1, 4, 90, first, second)]
     few = [_pair(5, 6, 20, second, second), _pair(6, 7, 20, second, second), _pair(0, 8, 20, first, first)]
-    mixed, left_out = separate_lenses([LENS] * 9, [*pairs, *few], 3.0, None)
+    with ThreadPoolExecutor(1) as executor:
+        mixed, left_out = separate_lenses([LENS] * 9, [*pairs, *few], 3.0, None, executor)
     assert mixed.certain
     assert left_out.keys() == {0, 1, 2}
 
@@ -156,7 +174,7 @@ def test_a_few_wrong_votes_are_no_lens() -> None:
 
 
 def test_lenses_that_differ_by_less_than_a_result_shows_are_one_and_pairs_that_see_nothing_say_nothing() -> None:
-    assert two_lenses([Camera((640, 480))] * 3, LensVotes.of([], 3.0)) is None
+    assert two_lenses([Camera((640, 480))] * 3, _voted([])) is None
     assert _divided(_CHAIN[:1], [-0.2, -0.1], std=0.05) is None
     assert _divided(_CHAIN, [-0.2] * 4 + [-0.185], 1e-4, size=(320, 240)) is None
     assert _divided(_CHAIN, [-0.2] * 4 + [-0.185], 1e-4, size=(640, 480)) is not None

@@ -59,7 +59,7 @@ def test_what_was_left_out_stays_out_of_other_hypotheses(tmp_path: Path) -> None
 def test_what_remains_has_metric_poses_where_they_are_needed(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
-    def aligned(aligner: Aligner, pairs: object) -> AlignedPairs:
+    def aligned(aligner: Aligner, pairs: object, known: None) -> AlignedPairs:
         asked.append(aligner.options.model)
         metric = registration().alignment
         return AlignedPairs((), replace(metric, poses=None) if aligner.options.model == "auto" else metric)

@@ -1,6 +1,7 @@
 """What is aligned of images that are there twice, and what is given of them."""
 
 from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,13 +12,15 @@ from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.alignment.least_squares.plane_marks import Sighting
 from rdstitch.alignment.motion_models import X
 from rdstitch.alignment.result import Unused
+from rdstitch.alignment.select import ModelChoice, select_model
 from rdstitch.features import Correspondences
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.links import Link
+from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.pipeline.aligner import Aligner
+from rdstitch.pipeline.aligner import Aligner, draft_with_loops
 from rdstitch.system.cache import NO_CACHE
 
 COPY = 12
@@ -106,3 +109,44 @@ def test_a_near_copy_over_relief_or_blurred_is_counted_once(relief: float, noise
     found = aligner.align(pairs).alignment
     assert found.used.all()
     assert {fit.reason for fit in found.links if 6 in fit.images} == {Unused.COPY}
+
+
+@pytest.mark.parametrize(("moved", "selections"), [(0.0, 1), (30.0, 2)])
+def test_the_model_is_chosen_again_only_where_more_pairs_disagree(
+    moved: float, selections: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = grid_scene(6, 4, seed=3, per_link=60, outliers=0.0)
+    pairs = [_registered(link) for link in given.links]
+    last = pairs.pop()
+    points = last.correspondences.points2 + moved
+    homography = np.array([[1.0, 0.0, moved / given.cameras[0].scale], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    relation = replace(last.relation, homography=homography @ last.relation.homography)
+    loop = replace(last, matches=StoredMatches.of(replace(last.correspondences, points2=points)), relation=relation)
+
+    class Estimator:
+        def __init__(self) -> None:
+            self.found = [loop]
+
+        def estimate(self, wanted: object, *, distortion: float) -> list[PairRegistration]:
+            found, self.found = self.found, []
+            return found
+
+        def progress(self, *_: object) -> None:
+            pass
+
+    chosen = []
+
+    def counted(*args: Any) -> ModelChoice:
+        chosen.append(select_model(*args))
+        return chosen[-1]
+
+    monkeypatch.setattr("rdstitch.alignment.recipe.select_model", counted)
+    aligner = Aligner(tuple(map(str, range(24))), tuple(given.cameras), AlignmentOptions(), NO_CACHE, 3.0)
+    found = draft_with_loops(aligner, cast(PairEstimator, Estimator()), pairs, [])
+    assert len(chosen) == selections
+    assert len(found.pairs) == len(given.links)
+    expected = aligner.draft([*pairs, loop]).alignment
+    assert found.alignment.model == expected.model
+    assert found.alignment.distortion == pytest.approx(expected.distortion, abs=1e-4)
+    whole, again = (aligner.completed(one).alignment for one in (found, aligner.draft([*pairs, loop])))
+    assert whole.distortion == pytest.approx(again.distortion, abs=1e-4)
