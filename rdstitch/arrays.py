@@ -4,11 +4,21 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from rdstitch.errors import ArgumentError
 
 BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+
+
+def as_numbers(name: str, values: ArrayLike) -> FloatArray:
+    """An argument as an array of float64; ArgumentError where it is none."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ArgumentError(f"{name} must be an array of numbers") from None
 
 
 def read_only(array: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from rdstitch.alignment.least_squares.plane_marks import ControlPoints, Sighting
 from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.lens.lens_selection import LENSES
 from rdstitch.alignment.motion_models import MODELS
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, as_numbers
 from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
@@ -66,7 +66,7 @@ class AlignmentOptions:
         """(ψ, θ), radians, of each of ``count`` images, where they are known exactly; None where not."""
         if self.tilt is None or (self.attitudes is not None and self.attitudes_std > 0.0):
             return None
-        attitudes = np.zeros((count, 2)) if self.attitudes is None else np.asarray(self.attitudes, dtype=np.float64)
+        attitudes = _of_images("attitudes", self.attitudes, (count, 2), missing=0.0)
         return [(psi, theta) for psi, theta in (attitudes + self.tilt).tolist()]
 
     def camera_priors(self, cameras: Sequence[Camera]) -> CameraPriors:
@@ -128,7 +128,7 @@ class GivenImages:
 
 def _of_images(name: str, given: ArrayLike | None, shape: tuple[int, ...], missing: float = math.nan) -> FloatArray:
     """What is given of each image, of this shape; ``missing`` where nothing is."""
-    values = np.full(shape, missing) if given is None else np.asarray(given, dtype=np.float64)
+    values = np.full(shape, missing) if given is None else as_numbers(name, given)
     if values.shape != shape:
         raise ArgumentError(f"{name} must have the shape {shape}, one row for each image, not {values.shape}")
     if np.isinf(values).any():

@@ -31,6 +31,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link, in_alternate_directions
 from rdstitch.results.messages import Message
+from rdstitch.robust.chance import occupied_cells
 
 # Side of an image, beside that of the largest, below which it was reduced, and must not set the scale of the output.
 _REDUCED = 0.8
@@ -47,11 +48,12 @@ _ROUNDS = 3  # rounds of rejecting wrong pairs and adjusting again
 def align(cameras: Sequence[Camera], links: Sequence[Link], options: AlignmentOptions | None = None) -> Alignment:
     """Align all images of one lens over one plane, or around one centre, by pairs that overlap, each once.
 
-    Links of fewer than five matches, which show nothing, are left out.
+    Links of matches in fewer than five places, which show nothing, are left out.
 
-    :exc:`ArgumentError` where two links are between the same images; :exc:`RegistrationError` where no two are linked.
+    :exc:`ArgumentError` where two links are between the same images; :exc:`RegistrationError` where no two are linked,
+    or no motion explains the matches.
     """
-    enough = [link for link in links if len(link.points1) >= FEWEST_MATCHES]
+    enough = [link for link in links if occupied_cells(link.points1, link.points2, *link.sizes) >= FEWEST_MATCHES]
     return AlignmentTask(cameras, enough, options or AlignmentOptions()).result
 
 

@@ -22,6 +22,7 @@ from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.alignment.starts import fit_model, start_from
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
+from rdstitch.robust.loss import NORMAL_MEDIAN
 
 _MIN_IMAGES = 3  # images: of two, tilts do what heights do, and the errors do not show which
 
@@ -29,7 +30,7 @@ _ROUNDS, _SETTLED = 4, 0.02
 """Of finding the scatter of the heights and adjusting again, and by how much it still changes at the end: at first the
 camera has followed the hills, so that it is found too small."""
 
-_NORMAL_MEDIAN, _MEDIAN_STD = 0.4549, 2.333
+_SQUARE_MEDIAN, _MEDIAN_STD = NORMAL_MEDIAN**2, 2.333
 """Median of the square of a normal variable of variance 1; the standard deviation of the median of N such squares, in
 medians and times the root of N."""
 
@@ -118,10 +119,10 @@ def _scatter(errors: FloatArray, parallax: FloatArray, effective: float) -> floa
     direction = parallax[moving] / length[:, None]
     along = np.einsum("mi,mi->m", errors, direction) ** 2
     across = (errors[:, 1] * direction[:, 0] - errors[:, 0] * direction[:, 1]) ** 2
-    noise = float(np.median(across)) / _NORMAL_MEDIAN if len(across) else 0.0
+    noise = float(np.median(across)) / _SQUARE_MEDIAN if len(across) else 0.0
     min_ratio = math.exp(_SIGNIFICANT * _MEDIAN_STD * math.sqrt(2.0 / (effective / 2.0)))
-    if noise <= 0.0 or float(np.median(along)) <= min_ratio * noise * _NORMAL_MEDIAN:
+    if noise <= 0.0 or float(np.median(along)) <= min_ratio * noise * _SQUARE_MEDIAN:
         return 0.0
     # Of this scatter the median of ``along / (noise + (scatter length)²)`` is what it is for normal variables.
-    variance = float(np.median((along / _NORMAL_MEDIAN - noise) / length**2))
+    variance = float(np.median((along / _SQUARE_MEDIAN - noise) / length**2))
     return math.sqrt(max(variance, 0.0) / noise)

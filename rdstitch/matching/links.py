@@ -58,6 +58,11 @@ class Link:
         """Number of inliers."""
         return len(self.points1) if self.count is None else self.count
 
+    @property
+    def sizes(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Width and height of both images, pixels."""
+        return self.relation.camera.image_size, self.relation.camera2.image_size
+
     def reversed(self) -> Self:
         """The same correspondences, from the second image to the first."""
         one, two = self.relation.camera, self.relation.camera2

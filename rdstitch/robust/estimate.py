@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.arrays import FloatArray, IntArray, as_numbers
 from rdstitch.choices import SolverName
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography, are_homographies
 from rdstitch.options.estimation_options import EstimationOptions
 from rdstitch.robust.chance import MIN_OCCUPIED_CELLS, occupied_cells, rejection_reason
-from rdstitch.robust.measurements import Measurements, as_numbers, checked_matches, padded_length
+from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import ModelSelection, PairFit, StartedPairs, rms_of
 from rdstitch.robust.pair_models import PlanarPairModel

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
+from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows, as_numbers
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 
@@ -78,14 +78,6 @@ def padded_length(count: int) -> int:
         return _MIN_WIDTH
     step = 1 << ((count - 1).bit_length() - _STEPS_PER_OCTAVE.bit_length())
     return -(-count // step) * step
-
-
-def as_numbers(name: str, values: ArrayLike) -> FloatArray:
-    """An argument as an array of float64; ArgumentError where it is none."""
-    try:
-        return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ArgumentError(f"{name} must be an array of numbers") from None
 
 
 def checked_matches(points1: ArrayLike, points2: ArrayLike) -> tuple[FloatArray, FloatArray]:

@@ -167,7 +167,7 @@ class BundleAdjuster:
     priors: Priors
     # variance of sums of errors over that of independent ones; weighs the correspondences against the priors
     overdispersion: float = 1.0
-    max_iterations: int = 60  # linearizations at most
+    max_iterations: int = 60  # linearizations and steps that fail, after which no other width of the loss is tried
     min_gain: float = MIN_GAIN  # expected relative fall of the cost that is worth another step
 
     def run(self, start: Parameters, *, wide_start: bool = False) -> BundleAdjustmentResult:

@@ -43,7 +43,7 @@ def describe_lens(alignment: Alignment, camera: Camera) -> tuple[str, ...]:
         largest = camera.one_parameter_fit()[2]
         first += f" (the nearest one-parameter lens, at most {largest:.1f} pixels from the lens found)"
     lines = [first, *(_coefficient(camera, std, index) for index in (1, 2) if free[index])]
-    lines += [f"{_ORDINALS[index]} coefficient not needed" for index in (1, 2) if not free[index]]
+    lines += [f"{_ORDINALS[index]} coefficient not estimated" for index in (1, 2) if not free[index]]
     middle = (np.array(camera.image_size) - 1.0) / 2.0
     if free[CENTER].all():
         x, y = camera.center

@@ -18,6 +18,7 @@ from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import Alignment, PlanarPoses, Unused
 from rdstitch.alignment.sentences import explain_unaligned
 from rdstitch.alignment.trajectory import Trajectory
+from rdstitch.arrays import FloatArray
 from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError, RdstitchError, RegistrationError
 from rdstitch.geometry.camera import Camera
@@ -351,9 +352,35 @@ def test_mistakes_of_the_caller() -> None:
             align(cameras, nothing)
 
 
+def _matched(points1: FloatArray, points2: FloatArray) -> Link:
+    camera = Camera((800, 600)).with_focal(600.0)
+    return Link(0, 1, points1, points2, RadialHomography(np.eye(3), camera, camera, np.ones(len(points1), np.bool_)))
+
+
+@pytest.mark.parametrize("model", ["auto", "homography"])
+@pytest.mark.parametrize("count", [20, 60])
+def test_matches_at_random_are_no_alignment(model: str, count: int) -> None:
+    points = np.random.default_rng(0).uniform((0.0, 0.0), (799.0, 599.0), (2, count, 2))
+    link = _matched(*points)
+    with pytest.raises(RegistrationError, match="do not agree"):
+        align([link.relation.camera] * 2, [link], AlignmentOptions(model=model))
+
+
+def test_one_place_that_is_matched_many_times_links_nothing() -> None:
+    link = _matched(np.tile([10.0, 20.0], (30, 1)), np.tile([15.0, 25.0], (30, 1)))
+    with pytest.raises(RegistrationError, match="no two images overlap"):
+        align([link.relation.camera] * 2, [link])
+
+
+def test_exact_attitudes_are_checked_like_the_others() -> None:
+    with pytest.raises(ArgumentError, match="attitudes must have the shape"):
+        AlignmentOptions(tilt=(0.0, 0.0), attitudes=np.zeros(2)).exact_tilts(3)
+
+
 @pytest.mark.parametrize(
     ("options", "named"),
     [
+        ({"gravity": "up"}, "gravity must be an array of numbers"),
         ({"attitudes_std": math.nan}, "attitudes_std"),
         ({"tilt": (0.1, 0.2, 0.3)}, "tilt must be"),
         ({"tilt": (math.inf, 0.0)}, "tilt must be finite"),

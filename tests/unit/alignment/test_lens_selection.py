@@ -185,7 +185,7 @@ def test_a_known_lens_is_kept_whole() -> None:
 def test_the_description_says_what_is_needed() -> None:
     plain = described(aligned(lens_scene(Camera(SIZE, -0.25), 0, columns=3, rows=2)))
     assert "±" in plain[0]
-    assert "second coefficient not needed" in plain
+    assert "second coefficient not estimated" in plain
     strong = described(fisheye_alignment()[1])
     assert "nearest one-parameter lens" in strong[0]
     assert any(line.startswith("second coefficient μ = -0.0") for line in strong)
