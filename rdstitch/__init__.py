@@ -35,7 +35,7 @@ _NAMES = {
     "results.messages": "Message",
     "results.pose": "FollowedPoses Pose",
     "results.registration": "Registration",
-    "results.stitch_result": "StitchResult",
+    "results.stitch_result": "OutputImage StitchResult",
     "robust": "estimate_radial_homography",
     "sidecar.recomposition": "Recomposition",
 }

@@ -33,6 +33,7 @@ from rdstitch.results.messages import Message as Message
 from rdstitch.results.pose import FollowedPoses as FollowedPoses
 from rdstitch.results.pose import Pose as Pose
 from rdstitch.results.registration import Registration as Registration
+from rdstitch.results.stitch_result import OutputImage as OutputImage
 from rdstitch.results.stitch_result import StitchResult as StitchResult
 from rdstitch.robust import estimate_radial_homography as estimate_radial_homography
 from rdstitch.sidecar.recomposition import Recomposition as Recomposition

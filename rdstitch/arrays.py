@@ -44,9 +44,9 @@ class Rows:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
-        """The rows of at least one part, one after the other; what is None in the first part is None."""
+        """The rows of at least one part, one after the other; a field is None in all of them, or in none."""
         columns = ([getattr(part, name) for part in parts] for name in cls.__dataclass_fields__)
-        return cls(*(None if column[0] is None else np.concatenate(column) for column in columns))
+        return cls(*(None if all(v is None for v in column) else np.concatenate(column) for column in columns))
 
     def put(self, rows: NDArray[Any], others: Self) -> None:
         """Replace some rows."""

@@ -90,7 +90,7 @@ def _flag(entry: Declared, default: Any) -> click.Option:
     how |= _KINDS.get(kind, _entered)(entry, default)
     shown = how.pop("shown", plain)
     shown = option.default or shown
-    text = option.text + f"  [default: {shown}]" * bool(shown)
+    text = option.in_unit("degrees") + f"  [default: {shown}]" * bool(shown)
     return Flag(names, metavar=option.metavar or None, help=text, declared=option, **how)
 
 

@@ -116,17 +116,20 @@ class Trajectory:
         return replace(path, covariance=change @ one @ change.T + mixed + mixed.transpose(0, 2, 1) + moved)
 
     @classmethod
-    def on_map(cls, poses: PlanarPoses, to_map: FloatArray) -> Self:
+    def on_map(cls, poses: PlanarPoses, to_map: FloatArray, map_scale: float = 1.0) -> Self:
         """The poses that are not NaN on a map: positions are (easting, -northing), so that "enu" gives both.
 
         Parameters
         ----------
         to_map : ndarray of shape (2, 3)
-            A similarity from the plane of the poses, y downwards, to easting and northing.
+            A similarity from the plane of the poses, y downwards, to easting and northing, m on the map.
+        map_scale : float
+            Metres of the map per metre on the ground, in which heights are.
         """
         frame = np.flatnonzero(np.isfinite(poses.yaw))
         change = np.diag([1.0, -1.0]) @ to_map
         unit, turn = math.hypot(to_map[0, 0], to_map[1, 0]), math.atan2(to_map[1, 0], to_map[0, 0])
+        unit /= map_scale
         position = poses.position[frame] @ change[:, :2].T + change[:, 2]
         path = cls(frame, position, np.unwrap(poses.yaw[frame] + turn), poses.height[frame] * unit)
         if poses.covariance is None:

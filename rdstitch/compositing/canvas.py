@@ -262,8 +262,9 @@ def _refuse_disproportionate(
         )
 
 
-def refuse_scale(cameras: Sequence[Camera], extent: FloatArray) -> None:
-    """Refuse a scale that leaves nothing of the images, or blows them up beyond all sense."""
+def refuse_scale(cameras: Sequence[Camera], extent: ArrayLike, advice: str = "use a --scale nearer to 1") -> None:
+    """Refuse a canvas that leaves nothing of the images, or that enlarges them over 400 times in all."""
+    extent = np.asarray(extent, dtype=np.float64)
     pixels = sum(c.image_size[0] * c.image_size[1] for c in cameras)
     if float(extent.min()) < 1.0 or float(np.prod(extent)) > _MAX_ENLARGEMENT * pixels:
-        raise LimitError(f"the canvas would have {extent[0]:.3g} x {extent[1]:.3g} pixels; use a --scale nearer to 1")
+        raise LimitError(f"the canvas would have {extent[0]:.3g} x {extent[1]:.3g} pixels; {advice}")

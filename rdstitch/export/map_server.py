@@ -83,8 +83,10 @@ def map_files(folder: Path) -> list[Path]:
     return [folder / "map.yaml", folder / "map.png"]
 
 
-def check_map_server(output: Path, height: float | None) -> None:
+def check_map_server(output: Path | None, height: float | None) -> None:
     """Refuse an output of which no map can be made."""
+    if output is None:
+        raise ArgumentError("--map-server is made from the output: name one")
     if (suffix := output.suffix.lower()) in (".dzi", ".zarr"):
         raise ArgumentError(f"--map-server is made from the output: write .png, .jpg or .tif instead of {suffix}")
     if height is None:

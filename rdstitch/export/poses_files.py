@@ -3,7 +3,8 @@
 COLMAP's world has x to the east, y to the north and z up, in metres from a place that the first line tells, where the
 output is georeferenced; else x to the right and y to the top of the plane, in heights of the reference image. Its
 quaternions and translations lead from there to a camera with x to the right, y down and z ahead; camera 1 is that of
-``--save-camera cameras.txt``.
+``--save-camera cameras.txt``. Its metres are those of the map, heights too; in the other files heights are metres on
+the ground.
 """
 
 import math
@@ -20,6 +21,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.export.trajectory_files import as_csv
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rigid_in_plane, rotation_from_tilt
+from rdstitch.georeferencing.georeference import Georeference
 from rdstitch.inputs.times import timestamps_of
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.late_imports import spatial
@@ -35,21 +37,22 @@ def poses_table(result: StitchResult, frame: PosesFrame = "enu", height: float =
     registration = result.registration
     path = Trajectory.from_alignment(registration.alignment, height)
     if frame == "map":
-        path = Trajectory.on_map(*_poses_and_map(result))
+        poses, to_map, place = _poses_and_map(result)
+        path = Trajectory.on_map(poses, to_map, place.map_scale)
     sources = registration.sources
     numbers = [source.number(k) for k, source in enumerate(sources)]
     path = path.labelled([source.name for source in sources], numbers, timestamps_of(sources))
     return as_csv(path, "enu" if frame == "map" else frame)
 
 
-def _poses_and_map(result: StitchResult) -> tuple[PlanarPoses, FloatArray]:
-    """The poses, and what leads (2, 3) from their plane to the map."""
+def _poses_and_map(result: StitchResult) -> tuple[PlanarPoses, FloatArray, Georeference]:
+    """The poses, what leads (2, 3) from their plane to the map, and the place of the output there."""
     place, poses = result.georeference, result.registration.alignment.poses
     if place is None or poses is None:
         raise ArgumentError(f"there is no map for the poses: {result.not_georeferenced}; leave out --frame map")
     if (to_pixels := result.canvas.from_level_plane) is None:
         raise ArgumentError("poses have no map where the plane was tilted to be upright; leave out --frame map")
-    return poses, place.pixel_to_map @ to_pixels
+    return poses, place.pixel_to_map @ to_pixels, place
 
 
 def poses_file(result: StitchResult, file: str | Path, frame: PosesFrame = "enu", height: float = 1.0) -> str:
@@ -64,15 +67,16 @@ def poses_file(result: StitchResult, file: str | Path, frame: PosesFrame = "enu"
     if blank := next((name for name in names if any(map(str.isspace, name))), None):
         raise ArgumentError(f"{file}: names end at blanks there; rename {blank}")
     if name == "geo.txt":
-        place = result.georeference
-        poses, to_map = _poses_and_map(result)
-        assert place is not None
-        unit = math.hypot(to_map[0, 0], to_map[1, 0])
+        poses, to_map, place = _poses_and_map(result)
+        heights = poses.height * math.hypot(to_map[0, 0], to_map[1, 0]) / place.map_scale
         known = (None if s.metadata.gps is None else s.metadata.gps.altitude for s in sources)
         altitudes = [math.nan if altitude is None else altitude for altitude in known]
-        above = np.array(altitudes) - unit * poses.height
+        above = np.array(altitudes) - heights
         ground = float(np.median(above[np.isfinite(above)])) if np.isfinite(above).any() else 0.0
-        return _geo_of_opendronemap(names, poses, to_map, place.crs.epsg, ground)
+        centres = np.column_stack([_on_map(poses, to_map)[:, :2], ground + heights])
+        located = [(name, centre) for name, centre in zip(names, centres, strict=True) if np.isfinite(centre).all()]
+        rows = ["{} {:.4f} {:.4f} {:.4f}".format(name, *centre) for name, centre in located]
+        return "\n".join([f"EPSG:{place.crs.epsg}", *rows]) + "\n"
     if poses is None:
         raise ArgumentError(f"{file}: one homography per image has no poses; --model pose gives some")
     if len({_lens(camera) for camera in result.registration.alignment.cameras}) > 1:
@@ -104,16 +108,8 @@ def _images_of_colmap(names: Sequence[str], poses: PlanarPoses, to_map: FloatArr
     return "\n".join(lines) + "\n"
 
 
-def _geo_of_opendronemap(names: Sequence[str], poses: PlanarPoses, to_map: FloatArray, epsg: int, ground: float) -> str:
-    """The text of ``geo.txt``: easting, northing and altitude of each camera; the ground is at an altitude, m."""
-    centres = _on_map(poses, to_map) + np.array([0.0, 0.0, ground])
-    known = np.flatnonzero(np.isfinite(poses.yaw)).tolist()
-    rows = ["{} {:.4f} {:.4f} {:.4f}".format(names[k], *centres[k]) for k in known]
-    return "\n".join([f"EPSG:{epsg}", *rows]) + "\n"
-
-
 def _on_map(poses: PlanarPoses, to_map: FloatArray) -> FloatArray:
-    """East, north and height (N, 3) of the cameras."""
+    """East, north and height (N, 3) of the cameras, m on the map."""
     unit = float(np.hypot(to_map[0, 0], to_map[1, 0]))
     places = poses.position @ to_map[:, :2].T + to_map[:, 2]
     return np.concatenate([places, poses.height[:, None] * unit], axis=1)

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from rdstitch.alignment.trajectory import Trajectory
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.choices import TrajectoryFrame
 from rdstitch.geometry.path_frames import AXES, covariance_in_frame, in_frame, turn_about_z
 
@@ -35,12 +35,12 @@ def path_as_svg(path: Trajectory, unit_name: str = "heights") -> str:
     points = (path.position - low) * unit + _MARGIN
     width, height = extent * unit + 2 * _MARGIN
     line = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
-    step = max(1, len(path) // _ARROWS)
+    shown = evenly_spaced(len(path), _ARROWS)
     # The camera turns by -φ when the image of the plane turns by φ; its top edge points to -y.
     heading = np.stack([-np.sin(path.yaw), -np.cos(path.yaw)], axis=1) * 0.5 * _MARGIN
     arrows = "".join(
         f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x + dx:.1f}" y2="{y + dy:.1f}" marker-end="url(#tip)"/>'
-        for (x, y), (dx, dy) in zip(points[::step], heading[::step], strict=True)
+        for (x, y), (dx, dy) in zip(points[shown], heading[shown], strict=True)
     )
     scale = 10.0 ** np.floor(np.log10(max(float(extent.max()), 1e-12)))
     return f"""<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" font-family="sans-serif">

@@ -11,9 +11,11 @@ coefficients.
 
 import math
 import operator
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -47,10 +49,33 @@ _NEAREST_HORIZON = 0.2  # half diagonals: a circle of 180 degrees that is smalle
 _MAX_STRETCH = 20.0
 """How much the lens may stretch what is drawn where it sees beyond the horizon: to 77 degrees off the axis."""
 
-_IMAGE_CENTER = (math.nan, math.nan)
-"""Stands for the image centre until :class:`Camera` puts that in its place: this object only, other NaN are refused."""
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "distortion": (),
+    "distortion2": (),
+    "distortion3": (),
+    "center": (2,),
+    "focal": (),
+    "focal_std": (),
+    "distortion_std": (),
+    "tilt": (2,),
+    "tilt_std": (2,),
+    "image_circle": (),
+    "lens_covariance": (5, 5),
+}
+"""Of the numbers that a camera has."""
 
 _GUESSED_FOCAL = 1.2  # half diagonals: a 26 mm lens on 36 x 24 mm, in the middle of what phones and drones carry
+
+
+def _real_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Any:
+    """A number, or tuples of them, of a shape."""
+    if not shape and not isinstance(value, bool) and isinstance(value, Real):
+        return float(value)
+    rows = tuple(value) if shape and isinstance(value, Iterable) else ()
+    if not rows or len(rows) != shape[0]:
+        wanted = " x ".join(map(str, shape)) + " numbers" if shape else "a number"
+        raise ArgumentError(f"{name} of a camera must be {wanted}, not {value!r}")
+    return tuple(_real_numbers(name, row, shape[1:]) for row in rows)
 
 
 def is_focal_length(focal: float, image_size: tuple[int, int]) -> bool:
@@ -111,9 +136,9 @@ class Camera:
     Raises
     ------
     ArgumentError
-        When a value is not finite, or a standard deviation negative; when the lens folds the image: its model must be
-        one-to-one out to the corners, or to the horizon, the rays at 90 degrees to its axis; or when that is so near
-        that next to nothing is seen.
+        When a value is of another type or shape, or not finite, or a standard deviation negative; when the lens folds
+        the image: its model must be one-to-one out to the corners, or to the horizon, the rays at 90 degrees to its
+        axis; or when that is so near that next to nothing is seen.
 
     Notes
     -----
@@ -124,7 +149,7 @@ class Camera:
     image_size: tuple[int, int]
     distortion: float = 0.0
     distortion2: float = 0.0
-    center: tuple[float, float] = _IMAGE_CENTER
+    center: tuple[float, float] = None  # type: ignore[assignment]  # never so once it is made
     focal: float | None = None
     focal_source: str | None = None
     distortion_std: float | None = None
@@ -145,13 +170,10 @@ class Camera:
         if width < 1 or height < 1:
             raise ArgumentError(f"image size must be at least 1 x 1 pixel, not {width} x {height}")
         object.__setattr__(self, "image_size", (width, height))
-        if self.center is _IMAGE_CENTER:
-            object.__setattr__(self, "center", self.image_center)
-        for name in ("center", "tilt", "tilt_std"):  # tuples, whatever was given: cameras are compared and hashed
-            if (values := getattr(self, name)) is not None:
-                object.__setattr__(self, name, tuple(map(float, values)))
-        if (rows := self.lens_covariance) is not None:
-            object.__setattr__(self, "lens_covariance", tuple(tuple(map(float, row)) for row in rows))
+        for name, shape in _SHAPES.items():  # tuples, whatever was given: cameras are compared and hashed
+            value = self.image_center if name == "center" and self.center is None else getattr(self, name)
+            if value is not None or self.__dataclass_fields__[name].default is not None:
+                object.__setattr__(self, name, _real_numbers(name, value, shape))
         self._check_numbers()
         self._check_focal()
         self._check_lens()

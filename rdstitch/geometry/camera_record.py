@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, cast
 
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
-from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.camera import FOCAL_LOG_STD, Camera
 from rdstitch.geometry.lens_model import LensModel
 from rdstitch.system.file_access import read_text
 from rdstitch.system.output_checks import check_output
@@ -64,6 +64,7 @@ class CameraRecord(LensRecord):
     version: Annotated[int, Meta(ge=1, le=VERSION)]
     image_size: Size
     lambda_std: NonNegative | None = None
+    lambda_observable: bool = True
     lambda_fit_rms_px: NonNegative = 0.0
     lambda_fit_largest_px: NonNegative = 0.0
     lens_covariance: _Covariance | None = None
@@ -79,12 +80,17 @@ class CameraRecord(LensRecord):
     def camera(self) -> Camera:
         """The camera that it describes."""
         lens = self.lens(self.image_size)
+        source, std = lens.focal_source, self.focal_std_px
+        if source not in ("guess", "exif"):  # which are no calibration by being saved
+            if lens.focal is not None and source == "estimate" and std is None:
+                std = FOCAL_LOG_STD[source] * lens.focal
+            source = None if lens.focal is None else "file"
         return replace(
             lens,
-            focal_source=None if lens.focal is None else "file",
-            distortion_std=self.lambda_std,
+            focal_source=source,
+            distortion_std=self.lambda_std if self.lambda_observable else math.inf,
             lens_covariance=self.lens_covariance,
-            focal_std=self.focal_std_px,
+            focal_std=std,
             tilt=_converted(math.radians, self.tilt_deg),
             tilt_std=_converted(math.radians, self.tilt_std_deg),
         )
@@ -110,11 +116,15 @@ def lens_fields(camera: Camera) -> dict[str, Any]:
 def camera_record(camera: Camera) -> CameraRecord:
     """Everything known of a camera."""
     _, rms, largest = camera.one_parameter_fit()
+    if camera.focal_std == math.inf:  # nothing was found of it
+        camera = replace(camera, focal_source="guess", focal_std=None)
+    tilt_std = camera.tilt_std if camera.tilt_std and all(map(math.isfinite, camera.tilt_std)) else None
     return CameraRecord(
         "rdstitch camera",
         VERSION,
         camera.image_size,
         lambda_std=camera.distortion_std,
+        lambda_observable=camera.distortion_std != math.inf,
         lambda_fit_rms_px=rms,
         lambda_fit_largest_px=largest,
         lens_covariance=cast("_Covariance | None", camera.lens_covariance),
@@ -122,7 +132,7 @@ def camera_record(camera: Camera) -> CameraRecord:
         lambda_focal=camera.distortion_focal,
         focal_std_px=camera.focal_std,
         tilt_deg=_converted(math.degrees, camera.tilt),
-        tilt_std_deg=_converted(math.degrees, camera.tilt_std),
+        tilt_std_deg=_converted(math.degrees, tilt_std),
         **lens_fields(camera),
     )
 

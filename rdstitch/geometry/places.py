@@ -40,10 +40,12 @@ def contradicting_places(
     names: Sequence[str], places: Sequence[tuple[float, float]], stds: Sequence[float | None]
 ) -> tuple[int, int, float] | None:
     """Two of some points (x, y), metres, of one name that are further apart than they are exact, and how far."""
-    first: dict[str, int] = {}
+    of_name: dict[str, list[int]] = {}
     for k, name in enumerate(names):
-        one = first.setdefault(name, k)
-        apart = math.dist(places[one], places[k])
-        if apart > max(stds[one] or MILLIMETRE, stds[k] or MILLIMETRE):
-            return one, k, apart
+        former = of_name.setdefault(name, [])
+        for one in former:
+            distance = math.dist(places[one], places[k])
+            if distance > max(stds[one] or MILLIMETRE, stds[k] or MILLIMETRE):
+                return one, k, distance
+        former.append(k)
     return None

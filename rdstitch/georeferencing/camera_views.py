@@ -60,8 +60,9 @@ def views_of(
     each = list(zip(cameras, to_output, strict=True))
     middle = np.array([_in_output(c, h, np.array(c.image_center)) for c, h in each])
     next_pixel = np.array([_in_output(c, h, np.array(c.image_center) + np.array([1.0, 0.0])) for c, h in each])
-    right = (next_pixel - middle) / np.abs(next_pixel - middle)
-    pixel = float(np.median(np.abs(next_pixel - middle)))
+    with np.errstate(invalid="ignore"):  # an image beyond the horizon has no middle
+        right = (next_pixel - middle) / np.abs(next_pixel - middle)
+    pixel = float(np.nanmedian(np.abs(next_pixel - middle)))
     focal = np.array([np.nan if c.focal is None else c.focal for c in cameras])
     if np.isfinite(focal).all() and (centres := _centres(cameras, focal, to_output)) is not None:
         known = cameras[0]

@@ -93,7 +93,7 @@ class Georeference:
         factor = complex(change[0, 0], change[0, 1])
         scale = self.scale / factor
         if abs(scale.imag) < 1e-12 * abs(scale):
-            scale = complex(abs(scale))
+            scale = complex(scale.real)  # north, or south, is exactly up
         return replace(self, scale=scale, origin=self.origin - scale * complex(change[0, 2], -change[1, 2]))
 
     def in_pixels(self, other: "Georeference") -> FloatArray:

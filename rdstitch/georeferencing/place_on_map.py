@@ -80,7 +80,10 @@ def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georef
         for point in points:
             pixel = as_complex(to_plane(located.cameras[k], located.to_output[k], np.array([point.pixel])))[0]
             shown.setdefault((point.name, point.check), []).append((point, complex(pixel)))
-    means = {key: (same[0][0], complex(np.mean([pixel for _, pixel in same]))) for key, same in shown.items()}
+    means = {
+        key: (same[0][0], complex(np.mean([pixel for _, pixel in same if np.isfinite(pixel)] or [np.nan])))
+        for key, same in shown.items()
+    }
     control = [mean for (_, check), mean in means.items() if not check]
     checks = [mean for (_, check), mean in means.items() if check]
     if len(control) < MIN_POSITIONS:

@@ -214,7 +214,7 @@ def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, dist
     known = Camera(metadata.size) if camera is None else _fitted(camera, metadata)
     if focal is not None:
         known = known.with_focal(focal, "option")
-    elif known.focal is None and metadata.focal_px is not None:
+    elif known.focal_source in (None, "guess") and metadata.focal_px is not None:
         known = known.with_focal(metadata.focal_px, "exif")
     if distortion is None:
         return known

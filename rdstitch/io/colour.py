@@ -1,6 +1,7 @@
 """Colours that are no RGB: CIELAB and inks become sRGB, which is what images without a profile are taken for."""
 
 import io
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -69,6 +70,18 @@ def without_inks(image: Image.Image) -> Image.Image:
 
 def colour_space(profile: bytes) -> bytes:
     """What is equal of profiles of one colour space; images without one are taken for sRGB."""
-    if not profile or b"sRGB" in profile or b"s\0R\0G\0B" in profile:
-        return b""
-    return profile
+    is_named_srgb = b"sRGB" in profile or b"s\0R\0G\0B" in profile
+    return b"" if not profile or (is_named_srgb and not _is_linear(profile)) else profile
+
+
+@lru_cache(maxsize=16)
+def _is_linear(profile: bytes) -> bool:
+    """Whether samples are proportional to light, as those of "linear sRGB" are: middle grey is 188 in sRGB then."""
+    from PIL import ImageCms
+
+    try:
+        to_srgb = ImageCms.buildTransform(io.BytesIO(profile), ImageCms.createProfile("sRGB"), "RGB", "RGB")
+    except (ImageCms.PyCMSError, ImportError):
+        return False
+    grey = ImageCms.applyTransform(Image.new("RGB", (1, 1), (128, 128, 128)), to_srgb)
+    return bool(np.asarray(grey).mean() > (128 + 188) / 2)

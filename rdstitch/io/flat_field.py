@@ -54,10 +54,13 @@ def read_flat_field(file: str | Path, size: tuple[int, int], channels: int) -> F
             has = f"page {number} has {page.shape[1]} x {page.shape[0]} pixels"
             raise InputError(f"{file}: {has}, but the tiles {size[0]} x {size[1]}")
     planes = [page.reshape(*page.shape[:2], -1) for page in pages]
-    if any(plane.shape[2] not in (1, channels) for plane in planes):
-        raise InputError(f"{file}: has {planes[0].shape[2]} channels, but the tiles {channels}")
+    for number, plane in enumerate(planes, 1):
+        if plane.shape[2] not in (1, channels):
+            raise InputError(f"{file}: page {number} has {plane.shape[2]} channels, but the tiles {channels}")
+        if not np.isfinite(plane).all():
+            raise InputError(f"{file}: page {number} has values that are not finite")
     gain = planes[0]
-    if not (np.isfinite(gain).all() and (gain > 0).all()):
+    if not (gain > 0).all():
         raise InputError(f"{file}: a flat field must be positive everywhere")
     dark = planes[1] if len(planes) > 1 else np.zeros((1, 1, gain.shape[2]), dtype=np.float32)
     return FlatField(gain / gain.mean(axis=(0, 1)), dark)

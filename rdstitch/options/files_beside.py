@@ -43,8 +43,8 @@ class FilesBeside(Options):
     frame: PosesFrame = option(
         "enu",
         "Axes of --poses. enu, ros, camera: of the first image, as for 'rdstitch trajectory'. first: those of camera, "
-        "and the sidecar has them too: the first image is the reference. map: easting, northing and height in metres, "
-        "where the output is georeferenced.",
+        "and the sidecar has them too: the first image is the reference. map: easting, northing and height above the "
+        "ground, metres, where the output is georeferenced.",
     )
     height: Height = None
     map_server: Path | None = option(

@@ -26,7 +26,7 @@ AnyOptions = TypeVar("AnyOptions", bound="Options")
 class Option:
     """What is said of an option besides its type and its default; the limits hold for every number in it."""
 
-    text: str
+    text: str  # {unit} in it stands for "radians" in Python, and for "degrees" on the command line
     metavar: str = ""  # what help pages call the value; empty: by its type
     flag: str = ""  # as "--lambda", "-j --workers" or "--crop/--no-crop"; empty: by the name of the field
     least: float = -math.inf
@@ -41,6 +41,10 @@ class Option:
     writes: bool = False  # the same of one that is written
     command_line: bool = True
     pixels: bool = False  # whether it says which pixels the output has
+
+    def in_unit(self, unit: str) -> str:
+        """The text, of angles in a unit."""
+        return self.text.replace("{unit}", unit)
 
     def allows(self, number: float) -> bool:
         """Check a number by the limits."""
@@ -139,8 +143,8 @@ class Options:
             object.__setattr__(self, name, checked(option, value))
         for each in fields(self):
             kind: Any = each.default_factory
-            if isclass(kind) and issubclass(kind, Options) and not isinstance(getattr(self, each.name), kind):
-                raise ArgumentError(f"{each.name} must be {kind.__name__}, not {getattr(self, each.name)!r}")
+            if isclass(kind) and issubclass(kind, Options):
+                options_of(kind, getattr(self, each.name), each.name)
         for contradiction in self.contradictions:
             if all(any(map(self._is_given, side)) for side in (contradiction.names, contradiction.others)):
                 raise ArgumentError(contradiction.reason)
@@ -156,6 +160,15 @@ class Options:
         named = [values[name] for name, each in declared(self).items() if each.names_read(values[name])]
         within = [options.files for options in values.values() if isinstance(options, Options)]
         return [*files_in(*named), *chain(*within)]
+
+
+def options_of(kind: type[AnyOptions], given: AnyOptions | None, name: str = "options") -> AnyOptions:
+    """The options given, or the defaults; what is none of a kind is refused."""
+    if given is None:
+        return kind()
+    if not isinstance(given, kind):
+        raise ArgumentError(f"{name} must be {kind.__name__}, not {given!r}")
+    return given
 
 
 def files_in(*named: str | Path | None) -> list[Path]:
@@ -200,7 +213,8 @@ def _plain(value: Any) -> Any:
 
 def documented(kind: Class) -> Class:
     """Describe the options of a class in its documentation."""
-    entries = (f"{name}\n    {option.option.text}" for name, option in declared(kind).items())
+    options = declared(kind).items()
+    entries = (f"{name}\n    {each.option.in_unit(each.option.unit)}" for name, each in options)
     kind.__doc__ = "\n".join([kind.__doc__ or "", "", "Attributes", "----------", *entries])
     return kind
 

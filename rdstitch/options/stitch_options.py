@@ -73,7 +73,7 @@ class StitchOptions(RansacOptions):
     distortion: Distortion = None
     focal: float | None = option(None, "Focal length, pixels; otherwise from EXIF, or a guess.", "PX", above=0.0)
     tilt: tuple[float, float] | None = option(
-        None, "Known tilt of the camera, degrees.", "PSI,THETA", above=-math.pi / 2, below=math.pi / 2, unit="radians"
+        None, "Known tilt of the camera, {unit}.", "PSI,THETA", above=-math.pi / 2, below=math.pi / 2, unit="radians"
     )
     attitude: Literal["xmp"] | str | Path | None = option(
         None,
@@ -83,7 +83,7 @@ class StitchOptions(RansacOptions):
     )
     attitude_std: float = option(
         math.radians(1.0),
-        "Standard deviation of the attitudes, degrees; 0 for exact ones.",
+        "Standard deviation of the attitudes, {unit}; 0 for exact ones.",
         "DEG",
         least=0.0,
         most=math.pi / 2,

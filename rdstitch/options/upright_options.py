@@ -20,9 +20,9 @@ class UprightOptions(Options):
         Contradiction(("rectangle",), ("straighten", "level"), _TURN),
         Contradiction(("straighten",), ("level",), _TURN),
     )
-    yaw: float = option(0.0, "Turn the view of a panorama to the right, before it is projected.", "DEG")
-    pitch: float = option(0.0, "Turn the view of a panorama up, before it is projected.", "DEG")
-    roll: float = option(0.0, "Turn the view of a panorama clockwise, before it is projected.", "DEG")
+    yaw: float = option(0.0, "Turn the view of a panorama to the right, degrees, before it is projected.", "DEG")
+    pitch: float = option(0.0, "Turn the view of a panorama up, degrees, before it is projected.", "DEG")
+    roll: float = option(0.0, "Turn the view of a panorama clockwise, degrees, before it is projected.", "DEG")
     rectangle: Corners | None = option(
         None,
         "Four corners, pixels of the reference image as it is read, clockwise: they become an upright rectangle "

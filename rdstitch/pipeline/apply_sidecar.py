@@ -16,7 +16,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.matching.band_lens import BandLens, band_lens
 from rdstitch.options.apply_options import ApplyOptions
-from rdstitch.options.option import declared, with_fields
+from rdstitch.options.option import declared, options_of, with_fields
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.compose import CanvasPlan, compose_images
 from rdstitch.pipeline.replacements import read_replacements
@@ -57,11 +57,12 @@ def apply(
     output : path, optional
         Image to write, with a sidecar of its own beside it; without it the image is in the result.
     composite : CompositeOptions, optional
-        Those of the sidecar if not given.
+        All of them, instead of those of the sidecar.
     options : ApplyOptions, optional
     progress : callable
     **fields
-        Fields of the options, instead of those in ``options``: ``apply(sidecar, images, match="order")``.
+        Fields of the options, instead of those in ``options``, in ``composite`` and in the sidecar:
+        ``apply(sidecar, images, match="order", scale=0.5)``. ``workers`` are those of ``options``.
 
     Returns
     -------
@@ -75,12 +76,16 @@ def apply(
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
     """
-    options = with_fields(options or ApplyOptions(), fields)
+    of_composite = declared(CompositeOptions).keys() - declared(ApplyOptions).keys()
+    composing = {name: fields.pop(name) for name in of_composite & fields.keys()}
+    options = with_fields(options_of(ApplyOptions, options), fields)
     saved = sidecar if isinstance(sidecar, SavedRegistration) else read_sidecar(sidecar)
     mismatch = mismatch_with_image(saved)
     if options.strict and mismatch:
         raise InputError(mismatch)
-    run = apply_run(saved, None if output is None else Path(output), composite or saved.composite, options, progress)
+    chosen = options_of(CompositeOptions, composite or saved.composite, "composite")
+    chosen = chosen.overridden(**composing)
+    run = apply_run(saved, None if output is None else Path(output), chosen, options, progress)
     given = as_inputs(images, options.channel_order)
     if saved.record.stage is not None:
         given = with_position_folders(given)

@@ -1,5 +1,6 @@
 """What a run will meet: a look at each image, and the plan of a mosaic of small versions of them."""
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -18,6 +19,8 @@ from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.read import DecodedImage
+from rdstitch.options.option import check_parameter
+from rdstitch.options.shared_options import Every
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.results.messages import Message, bytes_in_words, merge_by_reason, seconds_in_words, shortened
@@ -139,6 +142,7 @@ def examine(
     InputError
         When an input names nothing, or nothing can be read.
     """
+    check_parameter("every", Every, every)
     with found_images(as_inputs(inputs, channel_order), every=every, topic=topic) as listed:
         sources, unreadable, (sharpness, brightness, burnt_out) = _measured(listed.frames, progress)
         plan, registration, problems = _dry_run(listed.frames, progress) if len(sources) > 1 else (None, None, ())
@@ -183,7 +187,10 @@ def _measured(frames: Sequence[Frame], progress: Progress) -> tuple[list[Source]
         progress("examining", done, len(sources))
     if not read:
         raise InputError(unreadable[0] if unreadable else "there is nothing to examine")
-    return read, unreadable, np.array(measured).T
+    sharpness, brightness, burnt, full = np.array(measured).T
+    # A sensor of 12 or 14 bits shows how much of 16 it fills in the brightest image; any darker one is not burnt out.
+    part = np.nan_to_num(full / np.nanmax(full, initial=0.0), nan=1.0)
+    return read, unreadable, np.stack([sharpness, brightness * part, np.where(part < 1.0, 0.0, burnt)])
 
 
 def _advice(found: Examination, problems: Sequence[Message], *, zoomed: bool) -> tuple[str, ...]:
@@ -228,26 +235,29 @@ def _dry_run(
     return plan, registration, tuple(problems)
 
 
-def _sharpness_and_exposure(image: DecodedImage) -> tuple[float, float, float]:
-    """Contrast of the finest detail over that of twice as coarse detail, 0 without any; mean brightness, 0 to 1; and
-    share of burnt-out pixels.
+def _sharpness_and_exposure(image: DecodedImage) -> tuple[float, float, float, float]:
+    """Contrast of the finest detail over that of twice as coarse detail, 0 without any; mean brightness, 0 to 1;
+    fraction of burnt-out pixels; and of 16 bits the full scale of as many as its samples need, else NaN.
     """
     samples = image.pixels
-    whole = samples.dtype.kind == "u"
-    full = float(np.iinfo(samples.dtype).max if whole else samples.max(where=np.isfinite(samples), initial=1e-12))
+    full, peak = 255.0, float(samples.max(where=np.isfinite(samples), initial=1e-12))
+    if samples.dtype != np.uint8:
+        full = 2.0 ** max(8, int(peak).bit_length()) - 1.0 if samples.dtype == np.uint16 else peak
     grey = samples if samples.ndim == 2 else samples[..., : min(3, samples.shape[2])].mean(axis=2)
     grey = np.ascontiguousarray(grey, dtype=np.float32) / np.float32(full)
     measured = np.isfinite(grey)
     seen = measured if image.alpha is None else measured & (image.alpha > 0)
     if not seen.any():
-        return 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, math.nan
     grey[~measured] = grey[seen].mean()
     height, width = (max(1, round(side / 2)) for side in grey.shape)
     coarse = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
     fine = float(np.abs(cv2.Laplacian(grey, cv2.CV_32F))[seen].mean())
     rough = float(np.abs(cv2.Laplacian(coarse, cv2.CV_32F)).mean())
     burnt = grey >= np.float32(254 / 255)
-    return fine / rough if rough > 1e-6 else 0.0, float(grey[seen].mean()), float(burnt[seen].mean())
+    sharpness = fine / rough if rough > 1e-6 else 0.0
+    scale = full if samples.dtype == np.uint16 else math.nan
+    return sharpness, float(grey[seen].mean()), float(burnt[seen].mean()), scale
 
 
 def _overlap(registration: Registration) -> float | None:

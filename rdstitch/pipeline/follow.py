@@ -27,6 +27,7 @@ from rdstitch.inputs.selection import is_selected, with_masks
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import time_of, timestamps_of
 from rdstitch.io.opening import check_readable
+from rdstitch.options.option import options_of
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.alignment_inputs import alignment_options
 from rdstitch.pipeline.given_camera import with_camera
@@ -112,8 +113,8 @@ class Tracker:
     def __init__(
         self, options: StitchOptions | None = None, poses: FollowedPoses | None = None, *, patient: bool = False
     ) -> None:
-        self._options, self._notes = with_camera(options or StitchOptions(), of_bag=False)
-        self._poses = poses or FollowedPoses()
+        self._options, self._notes = with_camera(options_of(StitchOptions, options), of_bag=False)
+        self._poses = options_of(FollowedPoses, poses, "poses")
         self._detection = _live_features(self._options.features)
         self._megapixels = self._detection.limits[1]
         given = self._options.odometry
@@ -172,7 +173,9 @@ class Tracker:
         wheels = (math.nan,) if odometry is None else _measured("odometry", odometry, 3)
         body = BodyPose(*wheels) if all(map(math.isfinite, wheels)) else None
         number = next(self._numbers)
-        (named,) = as_inputs(image, self._options.channel_order)
+        named, *more = as_inputs(image, self._options.channel_order)
+        if more:
+            raise ArgumentError(f"image must be one image, not {len(more) + 1}")
         frame = replace(named, path=Path(f"image_{number:04d}")) if isinstance(named, Frame) else Frame(Path(named))
         frame = replace(frame, number=number, timestamp=time)
         *revised, pose = self.register(frame, *self.read(frame, tilt), body)

@@ -8,6 +8,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
+from rdstitch.compositing.canvas import refuse_scale
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.crs import Crs
 from rdstitch.georeferencing.georeference import Georeference
@@ -36,7 +37,7 @@ def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
     """The canvas of the images, no larger than ``options.max_size``."""
     canvas = _plan(placed, options, options.scale)
     if placed.grid is not None:
-        return canvas.on_grid(placed.grid.from_plane, placed.grid.size)
+        return _on_grid(canvas, placed, placed.grid.from_plane, placed.grid.size)
     if options.max_size is None or max(canvas.size) <= options.max_size:
         return canvas
     # The canvas has whole pixels around the images, and a full turn a multiple of some: these may be too many.
@@ -89,7 +90,7 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
         return canvas, placed.grid.place, reason
     if (grid := _grid(options, place)) is not None:
         on_grid = grid.place.in_pixels(place) @ canvas.matrix
-        laid = canvas.on_grid(on_grid, grid.size)
+        laid = _on_grid(canvas, placed, on_grid, grid.size)
         if not any(_overlaps(outline, grid.size) for outline in laid.footprints):
             raise ArgumentError(f"none of the images lies within {options.like or 'the extent'}")
         # As in the file, without rounding.
@@ -114,6 +115,11 @@ def _grid(options: CompositeOptions, place: Georeference) -> MapGrid | None:
     if options.extent is None:
         return None
     return grid_of_extent(place.crs, options.extent, (options.gsd or place.gsd) * place.map_scale)
+
+
+def _on_grid(canvas: Canvas, placed: PlacedImages, from_plane: FloatArray, size: tuple[int, int]) -> Canvas:
+    refuse_scale(placed.cameras, size, "choose a smaller extent, or larger pixels")
+    return canvas.on_grid(from_plane, size)
 
 
 def _overlaps(outline: FloatArray, size: tuple[int, int]) -> bool:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
-from rdstitch.errors import RegistrationError
+from rdstitch.errors import ArgumentError, RegistrationError
 from rdstitch.export.trajectory_files import has_times, path_as_svg
 from rdstitch.export.write_trajectory import write_trajectory
 from rdstitch.inputs.find import FoundImages
@@ -19,7 +19,7 @@ from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
-from rdstitch.options.option import check_parameter
+from rdstitch.options.option import check_parameter, options_of
 from rdstitch.options.shared_options import Height
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import accept, scale_uncertainty
@@ -207,6 +207,8 @@ def calibrate(
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
     """
+    if replace(beside, report=None, command="") != NOTHING_BESIDE:
+        raise ArgumentError("calibrate composites nothing: beside it there is a report only")
     began = started(inputs, options, Purpose.CALIBRATE, every=every, progress=progress, beside=beside)
     with began as (listed, run, outputs):
         RunFiles.of_images(run, listed.files).check(outputs)
@@ -255,7 +257,7 @@ def trajectory(
     for name, kind, value in (("layout", TrajectoryFormat, layout), ("height", Height, height)):
         check_parameter(name, kind, value)
     check_parameter("frame", TrajectoryFrame | None, frame)
-    options = replace(options or StitchOptions(), pose_covariance=True)
+    options = replace(options_of(StitchOptions, options), pose_covariance=True)
     began = started(inputs, options, Purpose.TRAJECTORY, every=every, progress=progress)
     with began as (listed, run, outputs):
         RunFiles.of_path(run, listed.files, output, plot, layout).check(outputs)

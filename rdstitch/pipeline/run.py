@@ -3,16 +3,19 @@
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
 from rdstitch.choices import Purpose
+from rdstitch.errors import ArgumentError
 from rdstitch.executors import open_executor
 from rdstitch.inputs.find import FoundImages, found_images
 from rdstitch.inputs.frame import Images, Named, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.option import check_parameter, options_of
+from rdstitch.options.shared_options import Every
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.camera_path import with_odometry_of_bag
 from rdstitch.pipeline.given_camera import with_camera
@@ -47,6 +50,10 @@ class Run:
     ) -> Self:
         """Begin a run over inputs; the camera, and the odometry of a path, are read that options name, or a bag has."""
         options = options or StitchOptions()
+        if beside.frame == "first" and options.reference is not None:
+            raise ArgumentError("reference and frame first both name the reference; leave one of them out")
+        if beside.poses is not None:
+            options = replace(options, pose_covariance=True)
         if purpose is Purpose.TRAJECTORY:
             options = with_odometry_of_bag(inputs, options)
         known, notes = with_camera(options, inputs, of_bag=purpose is not Purpose.CALIBRATE)
@@ -72,7 +79,8 @@ def started(
     also_written: Sequence[Path] = (),
 ) -> Iterator[tuple[FoundImages, Run, Outputs]]:
     """Find images, none of which is among the outputs, and begin a run over them; files are published in the end."""
-    options = options or StitchOptions()
+    options, beside = options_of(StitchOptions, options), options_of(FilesBeside, beside, "beside")
+    check_parameter("every", Every, every)
     given = as_inputs(inputs, options.channel_order)
     run = Run.of(given, options, output, beside, progress, purpose)
     with (

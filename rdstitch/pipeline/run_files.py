@@ -57,7 +57,7 @@ class RunFiles:
             written.append(options.save_camera)
         written += [file for file in (beside.report, beside.hugin_project, beside.poses) if file is not None]
         folders = []
-        if beside.map_server is not None and run.output is not None:
+        if beside.map_server is not None:
             check_map_server(run.output, beside.height)
             folders.append(beside.map_server)
             written += map_files(beside.map_server)

@@ -21,7 +21,7 @@ from rdstitch.io.reduction import mean_of_channels
 from rdstitch.io.stored_tiles import StoredTile
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
-from rdstitch.options.option import with_fields
+from rdstitch.options.option import options_of, with_fields
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.options.tile_options import TileOptions
 from rdstitch.pipeline.lay_out import lay_out
@@ -81,7 +81,7 @@ def tiles(
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
     """
-    options = with_fields(options or TileOptions(), fields)
+    options = with_fields(options_of(TileOptions, options), fields)
     run = _tile_run(options, output, beside, progress)
     with (
         found_images(as_tiles(inputs), outputs=[run.output], topic=options.topic) as listed,
@@ -125,7 +125,7 @@ def place_tiles(
     inputs, options, progress, **fields
         As for :func:`tiles`.
     """
-    options = with_fields(options or TileOptions(), fields)
+    options = with_fields(options_of(TileOptions, options), fields)
     run = _tile_run(options, None, NOTHING_BESIDE, progress)
     with (
         found_images(as_tiles(inputs), topic=options.topic) as listed,

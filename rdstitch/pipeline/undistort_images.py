@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import ChannelOrder, Framing, ImageFormat
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedImage, compose
+from rdstitch.compositing.canvas import refuse_scale
 from rdstitch.errors import ArgumentError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.find import found_images
@@ -77,7 +78,7 @@ def undistort(
         λ in the half-diagonal frame, instead of a camera.
     view : str
         "same": size and scale at the centre stay. "all": everything that the image shows, at that scale. "valid":
-        the largest upright rectangle around the centre that the image covers, at that scale.
+        the largest rectangle about the middle of the image, of its aspect ratio, that it covers, at that scale.
     image_format : str, optional
         "jpg", "png", "tif" or "webp": of all files written. Without it each has that of its input, or, where that
         cannot be written (HEIC, raw, BMP, …), is a PNG file.
@@ -108,7 +109,10 @@ def undistort(
         for message in (*notes, *listed.messages):
             warn(message)
         if folder is None:
-            images = [to_channel_order(_undistorted(source, view).pixels, channel_order) for source in sources]
+            images = []
+            for done, source in enumerate(sources, start=1):
+                images.append(to_channel_order(_undistorted(source, view).pixels, channel_order))
+                progress("undistorting", done, len(sources))
             for message in guard.messages:
                 warn(message)
             return images
@@ -167,7 +171,8 @@ def undistorted_canvas(camera: Camera, view: Framing) -> Canvas:
         low, high = outline.min(axis=0), outline.max(axis=0)
     else:
         low, high = _inner_rectangle(outline, camera)
-    size = np.maximum(np.floor(high - low + 1e-6), 1).astype(int)
+    size = np.maximum(np.floor(high - low + 1e-6), 1)
+    refuse_scale([camera], size, 'choose the view "same" or "valid"')
     shift = -(low + 0.5)
     matrix = np.eye(3)
     matrix[:2, :2] *= camera.scale

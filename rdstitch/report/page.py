@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rdstitch.errors import ArgumentError
 from rdstitch.georeferencing.georeference import map_summary
 from rdstitch.report.lens import lens_curve, votes
 from rdstitch.report.mosaic import mosaic_section
@@ -62,9 +63,13 @@ def write_report(
 
     Raises
     ------
+    ArgumentError
+        When the result is none of these: what was composed again has no registration.
     OutputError
         When the file cannot be written.
     """
+    if not isinstance(result, StitchResult | Registration):
+        raise ArgumentError(f"a report is made of a StitchResult or a Registration, not of a {type(result).__name__}")
     output = result.output if isinstance(result, StitchResult) else None
     with Outputs.or_own(outputs) as staging:
         page = report_page(result, stages, command, None if output is None else staging.where(output))

@@ -9,24 +9,22 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import TrajectoryFrame
 from rdstitch.geometry.path_frames import covariance_in_frame, in_frame, ros_covariance
+from rdstitch.options.option import Options, documented, option
 from rdstitch.results.messages import Message
 from rdstitch.tracking import TrackingResult
 
 
+@documented
 @dataclass(frozen=True)
-class FollowedPoses:
-    """How poses are printed: as :func:`rdstitch.trajectory` writes them.
+class FollowedPoses(Options):
+    """How poses are printed: as :func:`rdstitch.trajectory` writes them."""
 
-    Attributes
-    ----------
-    height : float, optional
-        Of the first keyframe above the plane, in the unit that positions shall have; else as odometry says, or 1.
-    frame : str
-        "enu", "ros" or "camera", see :mod:`rdstitch.geometry.path_frames`.
-    """
-
-    height: float | None = None
-    frame: TrajectoryFrame = "enu"
+    height: float | None = option(
+        None,
+        "Of the first keyframe above the plane, in the unit that positions shall have; else as odometry says, or 1.",
+        above=0.0,
+    )
+    frame: TrajectoryFrame = option("enu", "See :mod:`rdstitch.geometry.path_frames`.")
 
 
 @dataclass(frozen=True)

@@ -33,18 +33,18 @@ def applied_sidecar(result: Recomposition, *, same_lens: bool) -> dict[str, Any]
     # An image without any image in it is never written.
     source = sources.get(saved.reference) or next(iter(sources.values()))
     # How far the camera was determined then.
-    determined = {name: getattr(then.camera, name) for name in ("lens_covariance", "tilt_deg", "tilt_std_deg")}
+    names = ("lens_covariance", "lambda_observable", "tilt_deg", "tilt_std_deg")
+    determined = {name: getattr(then.camera, name) for name in names}
     determined |= {"lambda_std": then.lambda_std, "focal_std_px": _resized_std(then.camera, source.camera.focal)}
-    camera = replace_fields(
-        camera_record(source.camera.turned(inverse(source.metadata.orientation))),
-        **(determined if same_lens else dict.fromkeys(determined)),
-    )
+    camera = camera_record(source.camera.turned(inverse(source.metadata.orientation)))
+    if same_lens:
+        camera = replace_fields(camera, **determined)
     of_lens = {"lambda_std": None, "lambda_known": False, "tilt_deg": None, "rms_px": None}
     now = replace_fields(
         then,
         **({} if same_lens else of_lens | {"lens_reason": "that of another band, from what images of both show"}),
         version=VERSION,
-        lambda_=source.camera.distortion,
+        lambda_=camera.lambda_,
         lambda_px=camera.lambda_px,
         lambda_focal=camera.lambda_focal,
         camera=camera,

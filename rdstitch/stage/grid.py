@@ -1,14 +1,19 @@
 """Nominal places of the tiles, their rows and columns."""
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.errors import ArgumentError
+from rdstitch.system.late_imports import spatial
 
 _SAME_LINE = 0.25  # share of a tile within which places belong to one row or column
+_NEAREST = 5  # places: a tile and one on each side of it
+_MAX_TURN = math.radians(22.5)  # of the stage to the camera; diagonal neighbours are farther from both axes
 # share of a tile's shorter side along which an overlap is worth comparing: corners of diagonal neighbours are not
 _MIN_OVERLAP = 0.3
 
@@ -39,12 +44,26 @@ class TileGrid:
     @property
     def rows(self) -> IntArray:
         """Row of each tile, from 0 at the top."""
-        return _lines(self.places[:, 1], _SAME_LINE * self.size[1])
+        return _lines(self._upright_places[:, 1], _SAME_LINE * self.size[1])
 
     @property
     def columns(self) -> IntArray:
         """Column of each tile, from 0 at the left."""
-        return _lines(self.places[:, 0], _SAME_LINE * self.size[0])
+        return _lines(self._upright_places[:, 0], _SAME_LINE * self.size[0])
+
+    @cached_property
+    def _upright_places(self) -> FloatArray:
+        """The places (N, 2), turned so that most neighbours lie along the axes."""
+        nearest = spatial.cKDTree(self.places).query(self.places, k=min(_NEAREST, len(self)))[1].reshape(len(self), -1)
+        places = self.places @ np.array([1.0, 1.0j])
+        off = places[nearest] - places[:, None]
+        off = off[off != 0.0]
+        # The angle to the nearer axis; diagonal neighbours are at neither.
+        angles = np.angle(off * 1j ** -np.rint(np.angle(off) / (np.pi / 2.0)))
+        angles = angles[np.abs(angles) < _MAX_TURN]
+        turn = np.exp(-1j * np.median(angles)) if len(angles) else 1.0
+        upright = places * turn
+        return np.stack([upright.real, upright.imag], axis=-1)
 
     def neighbours(self, reach: float) -> NDArray[np.intp]:
         """Pairs (M, 2) of tiles that may overlap along a good part of a side, ordered so that few are held at once."""

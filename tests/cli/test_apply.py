@@ -13,8 +13,8 @@ import numpy as np
 import PIL.Image
 import pytest
 
-from rdstitch import apply, mosaic
-from rdstitch.errors import InputError
+from rdstitch import CompositeOptions, apply, mosaic, write_report
+from rdstitch.errors import ArgumentError, InputError
 from rdstitch.io import read_image
 from rdstitch.io.metadata import read_metadata
 from rdstitch.sidecar.read import read_sidecar
@@ -41,6 +41,32 @@ def test_same_images_give_the_same_bytes(rdstitch: Run, frames: list[Path], stit
     third = tmp_path / "third.tif"
     _apply(rdstitch, _sidecar(output), frames[0].parent, third)
     assert third.read_bytes() == stitched.read_bytes()
+
+
+def test_lambda_of_a_lens_with_two_coefficients_is_that_of_the_nearest_one(
+    rdstitch: Run, frames: list[Path], tmp_path: Path
+) -> None:
+    image, again = tmp_path / "a.tif", tmp_path / "again.tif"
+    rdstitch("mosaic", *frames, "-o", image, "--lens", "division2", *CACHED)
+    _apply(rdstitch, _sidecar(image), frames[0].parent, again)
+    then, now = (sidecar_of(written) for written in (image, again))
+    assert then["camera"]["coefficients"][1] != 0.0
+    assert now["lambda"] == now["camera"]["lambda"] == then["lambda"] == then["camera"]["lambda"]
+    assert now["camera"] == then["camera"]
+
+
+def test_options_of_the_compositor_replace_those_of_the_sidecar_one_by_one(
+    frames: list[Path], stitched: Path, tmp_path: Path
+) -> None:
+    content = sidecar_of(stitched)
+    content["options"]["composite"] |= {"blend": "none", "exposure": "none"}
+    changed = tmp_path / "changed.json"
+    changed.write_text(json.dumps(content), encoding="utf-8")
+    result = apply(changed, frames, scale=0.5, workers=1)
+    assert (result.options.composite.scale, result.options.composite.blend) == (0.5, "none")
+    assert apply(changed, frames, composite=CompositeOptions(scale=0.5)).options.composite.blend == "multiband"
+    with pytest.raises(ArgumentError, match="a report is made of a StitchResult or a Registration, not of a Recompos"):
+        write_report(tmp_path / "r.html", result)  # type: ignore[arg-type]
 
 
 def test_local_alignment_is_applied_again(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

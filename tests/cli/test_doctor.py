@@ -28,6 +28,16 @@ def test_nothing_is_amiss(rdstitch: Run, frames: list[Path], tmp_path: Path) -> 
     assert found["plan"]["canvas_size"][0] > 800
 
 
+def test_twelve_bits_in_sixteen_are_as_bright_as_eight(frames: list[Path], tmp_path: Path) -> None:
+    for frame in frames:
+        cv2.imwrite(str(tmp_path / frame.name), cv2.imread(str(frame)).astype(np.uint16) * 16)
+    dark, burnt = (cv2.imread(str(frames[0])) * factor for factor in (0.05, 3.0))
+    cv2.imwrite(str(tmp_path / "dark.png"), np.rint(dark * 16).astype(np.uint16))
+    cv2.imwrite(str(tmp_path / "burnt.png"), np.minimum(np.rint(burnt * 16), 4095).astype(np.uint16))
+    found = examine(tmp_path)
+    assert (found.dark, found.burnt) == (("dark.png",), ("burnt.png",))
+
+
 def test_faults_are_found(frames: list[Path], stranger: Path, tmp_path: Path) -> None:
     copied(frames, tmp_path)
     copied([stranger], tmp_path, "stranger.png")

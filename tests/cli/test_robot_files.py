@@ -3,6 +3,7 @@
 import math
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -13,10 +14,11 @@ import pytest
 import yaml
 from PIL import Image
 
+import rdstitch
 from rdstitch.export import map_server
 from rdstitch.pipeline import recipes
 from rdstitch.pipeline.register import register
-from tests.cli.running import CACHED, Run, rows_of, sidecar_of
+from tests.cli.running import CACHED, OPTIONS, Run, rows_of, sidecar_of
 
 
 def _poses(file: Path) -> np.ndarray[Any, Any]:
@@ -70,6 +72,16 @@ def test_the_first_image_is_the_frame_of_all_that_is_written(rdstitch: Run, fram
     of_sidecar = np.array([[0.42 * pose["x"], 0.42 * pose["y"], pose["yaw_deg"]] for pose in poses])
     np.testing.assert_allclose(of_sidecar, path, atol=1e-3)
     assert (of_sidecar[0] == 0.0).all()
+    refused = ("mosaic", *frames, "-o", tmp_path / "g.png", "--reference", frames[1].name, *known)
+    rdstitch(*refused, status=2, told="reference and frame first both name the reference")
+
+
+def test_tables_of_poses_have_covariances_without_a_word_to_the_registration(
+    frames: list[Path], tmp_path: Path
+) -> None:
+    beside = rdstitch.FilesBeside(poses=tmp_path / "poses.csv")
+    rdstitch.mosaic(frames, tmp_path / "f.png", replace(OPTIONS, focal=380.0), beside=beside)
+    assert float(rows_of(tmp_path / "poses.csv")[1]["cov_x_x"]) > 0.0
 
 
 def test_the_first_image_that_has_a_place_is_the_frame(

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rdstitch import undistort
+from rdstitch.errors import LimitError
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import read_image, read_metadata
 from rdstitch.synthetic import Sequence
@@ -69,6 +71,20 @@ def _photograph(path: Path, size: tuple[int, int] = (400, 300)) -> Path:
     samples = np.random.default_rng(1).integers(0, 256, (size[1] // 4, size[0] // 4, 3), dtype=np.uint8)
     Image.fromarray(samples).resize(size).save(path, exif=exif, quality=95)
     return path
+
+
+def test_progress_is_told_of_arrays_too() -> None:
+    steps: list[tuple[int, int]] = []
+    images = [np.zeros((30, 40, 3), np.uint8)] * 3
+    undistort(images, distortion=-0.1, progress=lambda _, done, total: steps.append((done, total)))
+    assert steps == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_a_canvas_out_of_all_proportion_is_refused() -> None:
+    """Where the corner is near the horizon, all of the image would be 1,111 times as large."""
+    image = np.zeros((60, 80, 3), np.uint8)
+    with pytest.raises(LimitError, match=r'2\.67e\+03 x 2e\+03 pixels; choose the view "same" or "valid"'):
+        undistort([image], distortion=-0.97, view="all")
 
 
 @pytest.mark.parametrize("direct", [True, False])

@@ -192,3 +192,31 @@ def test_a_hopeless_matrix_still_gives_finite_numbers() -> None:
     for matrix in (np.eye(3), np.diag([1.0, 2.0, 3.0]), -np.eye(3)):
         found = PlanarMotion.from_homography(matrix)
         assert np.isfinite([*found.tilt, found.yaw, *found.translation, found.height]).all()
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"distortion": None},
+        {"distortion": "0.1"},
+        {"center": (1.0, 2.0, 3.0)},
+        {"center": 4.0},
+        {"focal": "500"},
+        {"focal": (500.0, 500.0)},
+        {"tilt": (0.1, 0.2, 0.3)},
+        {"tilt_std": ("a", "b")},
+        {"lens_covariance": ((1.0, 2.0),)},
+        {"lens_covariance": ((0.0,) * 5,) * 4},
+    ],
+)
+def test_values_of_another_shape_are_refused_by_name(bad: Any) -> None:
+    with pytest.raises(ArgumentError, match=rf"{next(iter(bad))} of a camera must be .*numbers?, not"):
+        Camera((640, 480), **bad)
+
+
+def test_numbers_become_those_of_python() -> None:
+    given: Any = {"distortion": np.float32(-0.25), "center": np.array([300, 200]), "focal": 500}
+    camera = Camera((640, 480), **given)
+    assert (camera.distortion, camera.center, camera.focal) == (-0.25, (300.0, 200.0), 500.0)
+    nothing: Any = None
+    assert Camera((640, 480), center=nothing) == Camera((640, 480))

@@ -38,11 +38,9 @@ def apply(
     shape. Compositing options that are not given are those of the sidecar.
     """
     from rdstitch.pipeline.apply_sidecar import apply as recipe
-    from rdstitch.sidecar.read import read_sidecar
 
     compositing = values_of(CompositeOptions, given)
     chosen = {name: value for name, value in compositing.items() if is_given(name)}
-    saved, options = read_sidecar(sidecar), ApplyOptions(**values_of(ApplyOptions, given))
-    composite = saved.composite.overridden(**chosen)
-    result = recipe(saved, resolve(images), output, composite, options=options, progress=reporter)
+    options = ApplyOptions(**values_of(ApplyOptions, given))
+    result = recipe(sidecar, resolve(images), output, options=options, progress=reporter, **chosen)
     report_applied(result, reporter)

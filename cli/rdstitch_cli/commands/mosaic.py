@@ -85,7 +85,7 @@ def mosaic(
     if bands is not None and (all_blocks or following or given["dry_run"]):
         raise click.UsageError("--bands goes neither with --all-blocks, --follow nor --dry-run")
     beside = files_beside(given)
-    options = stitch_options(given, preview=preview, pose_covariance=beside.poses is not None)
+    options = stitch_options(given, preview=preview)
     how: dict[str, Any] = {"every": every, "progress": reporter, "beside": beside}
     if bands is not None:
         from rdstitch.pipeline.bands import mosaic_bands, parse_bands  # with all that reads an earlier result

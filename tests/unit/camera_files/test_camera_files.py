@@ -90,12 +90,37 @@ def test_focal_length_and_tilt_keep_their_standard_deviations(tmp_path: Path, na
     assert found.with_focal(600.0, "option").focal_log_std == 0.01
 
 
+@pytest.mark.parametrize("source", ["guess", "exif"])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_focal_length_that_was_guessed_is_no_calibration_by_being_saved(
+    tmp_path: Path, name: str, source: str
+) -> None:
+    camera = Camera((640, 480), -0.2, focal=512.0, focal_source=source)
+    save_camera(camera, tmp_path / name)
+    found = load_camera(tmp_path / name)
+    assert (found.focal_source, found.focal_log_std) == (source, camera.focal_log_std)
+
+
+def test_a_focal_length_that_was_estimated_is_as_uncertain_as_before_it_was_saved(tmp_path: Path) -> None:
+    camera = Camera((640, 480), focal=512.0, focal_source="estimate")
+    for saved in (camera, replace(camera, focal_std=20.0)):
+        saved.save(tmp_path / "c.json")
+        assert Camera.load(tmp_path / "c.json").focal_log_std == pytest.approx(saved.focal_log_std)
+
+
+def test_a_focal_length_and_a_tilt_of_which_nothing_was_found_come_back_as_such(tmp_path: Path) -> None:
+    camera = Camera((640, 480), focal=512.0, focal_source="estimate", focal_std=math.inf)
+    replace(camera, tilt=(0.1, 0.2), tilt_std=(math.inf, math.inf)).save(tmp_path / "c.json")
+    found = Camera.load(tmp_path / "c.json")
+    assert (found.focal_source, found.focal_std, found.tilt_std) == ("guess", None, None)
+
+
 @pytest.mark.parametrize("camera", [*CAMERAS, UNOBSERVABLE, *ROUND])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_camera_comes_back_as_it_was(tmp_path: Path, name: str, camera: Camera) -> None:
     save_camera(camera, tmp_path / name)
     found = read_camera_file(tmp_path / name)
-    assert found.camera == (replace(camera, distortion_std=None) if camera.distortion_std == math.inf else camera)
+    assert found.camera == camera
     assert found.fit is None
 
 

@@ -12,6 +12,7 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import ArgumentError, LimitError, OutputError
 from rdstitch.export.map_server import write_map
 from rdstitch.export.poses_files import poses_file
+from rdstitch.export.trajectory_files import path_as_svg
 from rdstitch.export.write_trajectory import write_trajectory
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
@@ -65,6 +66,14 @@ def test_images_of_two_cameras_are_not_given_one(other: Camera) -> None:
 def test_names_that_other_programs_would_cut_are_refused(file: str) -> None:
     with pytest.raises(ArgumentError, match=rf"{file}: names end at blanks there; rename a b\.jpg"):
         poses_file(_result(["a b.jpg", "b.jpg"], [CAMERA, CAMERA]), file)
+
+
+@pytest.mark.parametrize(("frames", "arrows"), [(1, 1), (40, 40), (41, 40), (79, 40), (500, 40)])
+def test_a_path_has_forty_arrows_at_most(frames: int, arrows: int) -> None:
+    path = Trajectory(
+        np.arange(frames), np.random.default_rng(0).random((frames, 2)), np.zeros(frames), np.ones(frames)
+    )
+    assert path_as_svg(path).count("<line ") == arrows
 
 
 def test_a_bag_is_one_of_the_outputs(tmp_path: Path) -> None:

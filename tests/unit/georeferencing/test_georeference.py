@@ -1,5 +1,6 @@
 """The place of a mosaic on the Earth, from made-up positions."""
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,24 +14,28 @@ from PIL import ExifTags, Image
 from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import camera_file_text
 from rdstitch.compositing import CompositeOptions
-from rdstitch.errors import ArgumentError, OutputError
+from rdstitch.errors import ArgumentError, LimitError, OutputError
 from rdstitch.export.poses_files import poses_file, poses_table
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
 from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import from_plane, to_plane
+from rdstitch.georeferencing.camera_views import views_of
 from rdstitch.georeferencing.georeference import Georeference, map_summary, world_file_paths
+from rdstitch.georeferencing.map_grid import MapGrid
 from rdstitch.georeferencing.place_on_map import Located, place_on_map
 from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.io import ImageSpec, write_strips
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
+from rdstitch.pipeline.map_canvas import plan_on_map
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.report import report_page
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.robust.similarity_fit import fit_similarity
 from rdstitch.synthetic.poses import Poses
 from tests.cli.running import DISTORTION, flight, sidecar_of, transfers
+from tests.registrations import registration, stitched
 
 
 def _degrees(value: float) -> tuple[float, float, float]:
@@ -317,6 +322,54 @@ def test_the_ground_sample_distance_is_that_on_the_ground() -> None:
     other = utm_map.in_system(Crs(3857), [(0.0, 0.0), (2000.0, 100.0), (0.0, 300.0)])
     np.testing.assert_allclose(other.to_map([(1000.0, 0.0)]), web.to_map([(1000.0, 0.0)]), atol=0.02)
     assert other.gsd == pytest.approx(web.gsd, rel=0.002)
+
+
+@pytest.mark.parametrize("scale", [0.5 + 0.0j, -0.5 + 0.0j, 0.3 - 0.4j])
+def test_pixels_that_stay_keep_their_place(scale: complex) -> None:
+    place = Georeference(Crs(32632), scale, 400_000.0 + 5_000_000.0j, 0.1)
+    shifted = np.array([[1.0, 0.0, -7.0], [0.0, 1.0, 3.0], [0.0, 0.0, 1.0]])
+    pixels = np.array([(0.0, 0.0), (100.0, 20.0)])
+    assert place.after(np.eye(3)) == place
+    np.testing.assert_allclose(place.after(shifted).to_map(pixels + shifted[:2, 2]), place.to_map(pixels))
+
+
+def test_a_part_of_a_grid_whose_south_is_up_has_the_same_pixels() -> None:
+    grid = MapGrid((100, 80), Georeference(Crs(32632), -0.5 + 0.0j, 400_000.0 + 5_000_000.0j, 0.0))
+    part = grid.within((399_960.25, 5_000_009.75, 399_990.25, 5_000_030.25))
+    assert (part.size, part.place.scale) == ((60, 41), grid.place.scale)
+    np.testing.assert_allclose(part.place.to_map([(0.0, 0.0)]), [(399_990.0, 5_000_010.0)])
+
+
+def test_heights_on_a_map_are_metres_on_the_ground() -> None:
+    """The map of the web is 1.6 times as large there; positions are those of the map."""
+    flown = stitched(registration(2))
+    of_plane = np.linalg.inv(flown.canvas.matrix)
+    metres = 100.0 * of_plane[0, 0]  # 100 m to a height
+    utm = Georeference(Crs(32631), complex(metres), 500_000.0 + 5_762_000.0j, 0.1)
+    tables, ground = {}, utm.in_system(Crs(3857), flown.canvas.footprints[0])
+    for place in (utm, ground):
+        text = poses_table(replace(flown, georeference=place), "map")
+        tables[place.crs.epsg] = [float(row["height"]) for row in csv.DictReader(text.splitlines())]
+    assert ground.map_scale == pytest.approx(1.62, abs=0.01)
+    assert tables[3857] == pytest.approx(tables[32631], rel=2e-3)
+    assert tables[32631][0] == pytest.approx(100.0 * flown.registration.alignment.poses.height[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("pixel", [0.001, 0.05])
+def test_a_grid_out_of_all_proportion_is_refused_before_anything_is_made_of_it(pixel: float) -> None:
+    flown = stitched(registration(2))
+    placed = replace(flown.placed, place=Georeference(Crs(32631), complex(0.05), 500_000.0 + 5_762_000.0j, 0.1))
+    options = CompositeOptions(epsg=32631, gsd=pixel, extent=(400_000.0, 5_700_000.0, 600_000.0, 5_800_000.0))
+    with pytest.raises(LimitError, match=r"the canvas would have .* pixels; choose a smaller extent, or larger pixels"):
+        plan_on_map(placed, options)
+
+
+def test_an_image_beyond_the_horizon_leaves_the_others_their_pixel() -> None:
+    cameras, straight = [Camera((400, 300), focal=380.0)] * 3, np.diag([250.0, 250.0, 1.0])
+    behind = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
+    views = views_of(cameras, np.stack([straight, straight, behind]), [None] * 3)
+    assert np.isnan(views.ground).tolist() == [False, False, True]
+    assert views.pixel == pytest.approx(1.0)
 
 
 def _survey(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
 from rdstitch.io import read_image
+from rdstitch.io.colour import colour_space
 
 COLOURS = np.array([(200, 60, 60), (60, 200, 60), (40, 60, 200), (128, 128, 128), (250, 240, 200), (20, 25, 30)])
 PATCHES = np.repeat(np.repeat(COLOURS[None], 16, axis=0), 8, axis=1).astype(np.uint8)
@@ -88,3 +89,21 @@ def test_inks_without_a_profile_that_can_be_used(tmp_path: Path) -> None:
     assert "cannot be used" in broken.metadata.profile_lost
     tifffile.imwrite(tmp_path / "deep.tif", np.asarray(inks).astype(np.uint16) * 257, photometric="separated")
     np.testing.assert_array_equal(read_image(tmp_path / "deep.tif").pixels, PATCHES)
+
+
+def _with_curve(gamma: float) -> bytes:
+    """The profile of sRGB, still called so, with another curve."""
+    profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    (count,) = struct.unpack_from(">I", profile, 128)
+    for k in range(count):
+        name, place, _ = struct.unpack_from(">4sII", profile, 132 + 12 * k)
+        if name in (b"rTRC", b"gTRC", b"bTRC"):
+            struct.pack_into(">4sIHHi", profile, place, b"para", 0, 0, 0, round(gamma * 65536))
+    assert b"s\0R\0G\0B" in profile
+    return bytes(profile)
+
+
+def test_samples_proportional_to_light_are_no_srgb_whatever_their_profile_is_called() -> None:
+    assert colour_space(b"") == colour_space(_with_curve(2.2)) == b""
+    assert colour_space(_with_curve(1.0)) == _with_curve(1.0)
+    assert colour_space(b"sRGB but no profile") == b""

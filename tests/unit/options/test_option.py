@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import rdstitch
-from rdstitch import Camera, CompositeOptions, StitchOptions, TileOptions
+from rdstitch import Camera, CompositeOptions, FilesBeside, StitchOptions, TileOptions
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import Option, Options, documented
+from rdstitch.options.option import Option, Options, declared, documented
 
 
 @documented
@@ -84,6 +84,17 @@ def test_the_class_says_what_its_options_are() -> None:
     assert "number\n    A number." in (_Options.__doc__ or "")
 
 
+def test_angles_have_their_unit_for_each_reader() -> None:
+    for name in ("tilt", "attitude_std"):
+        text = declared(StitchOptions)[name].option
+        documentation = (StitchOptions.__doc__ or "").split(f"\n{name}\n")[1].splitlines()[0]
+        assert "radians" in documentation
+        assert "degrees" not in documentation
+        assert "degrees" in text.in_unit("degrees")
+    for name in ("yaw", "pitch", "roll", "rotate"):
+        assert "degrees" in (CompositeOptions.__doc__ or "").split(f"\n{name}\n")[1].splitlines()[0]
+
+
 @pytest.mark.parametrize("tilt", [(math.nan, 0.0), (2.0, 0.0)])
 def test_a_tilt_is_in_radians(tilt: tuple[float, float]) -> None:
     with pytest.raises(ArgumentError, match="radians"):
@@ -151,3 +162,46 @@ def test_files_that_are_read_are_inputs_that_no_output_may_replace(tmp_path: Pat
     assert TileOptions(flat_field="flat.tif", positions="p.csv").files == [Path("p.csv"), Path("flat.tif")]
     with pytest.raises(ArgumentError, match="positions and grid"):
         TileOptions(positions=np.zeros((2, 2)), grid="{row}")
+
+
+def test_what_is_of_another_kind_is_refused_by_name() -> None:
+    options: Any = {"workers": 2}
+    recipes: list[Any] = [rdstitch.pano, rdstitch.mosaic, rdstitch.calibrate, rdstitch.trajectory]
+    for recipe in recipes:
+        with pytest.raises(ArgumentError, match="options must be StitchOptions, not"):
+            recipe(["none"], options=options)
+        for every in (0, -1, 1.5):
+            with pytest.raises(ArgumentError, match="every must be a whole number from 1 to 1000000"):
+                recipe(["none"], every=every)
+    with pytest.raises(ArgumentError, match="every must be a whole number from 1 to 1000000"):
+        rdstitch.examine(["none"], every=0)
+    with pytest.raises(ArgumentError, match="beside must be FilesBeside, not"):
+        rdstitch.mosaic(["none"], beside=options)
+    with pytest.raises(ArgumentError, match="options must be TileOptions, not"):
+        rdstitch.tiles(["none"], options=options)
+    with pytest.raises(ArgumentError, match="options must be ApplyOptions, not"):
+        rdstitch.apply("none.json", ["none"], options=options)
+    with pytest.raises(ArgumentError, match="options must be StitchOptions, not"):
+        rdstitch.Tracker(options)
+    with pytest.raises(ArgumentError, match="poses must be FollowedPoses, not"):
+        rdstitch.Tracker(poses=options)
+    images: Any = [np.zeros((40, 30), np.uint8)] * 2
+    with pytest.raises(ArgumentError, match="image must be one image, not 2"):
+        rdstitch.Tracker().add(images)
+
+
+@pytest.mark.parametrize("wrong", [{"height": -2.0}, {"frame": "enuu"}])
+def test_poses_are_printed_in_a_frame_above_the_plane(wrong: Any) -> None:
+    with pytest.raises(ArgumentError, match=f"{next(iter(wrong))} must be"):
+        rdstitch.FollowedPoses(**wrong)
+
+
+def test_files_beside_neither_change_the_reference_nor_are_forgotten(tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError, match="reference and frame first both name the reference"):
+        rdstitch.mosaic(["none"], None, StitchOptions(reference="a.png"), beside=FilesBeside(frame="first"))
+    images = [np.zeros((40, 30), np.uint8)] * 2
+    with pytest.raises(ArgumentError, match="--map-server is made from the output"):
+        rdstitch.mosaic(images, beside=FilesBeside(map_server=tmp_path / "map", height=1.0))
+    for beside in (FilesBeside(poses=tmp_path / "p.csv"), FilesBeside(layers=tmp_path / "layers")):
+        with pytest.raises(ArgumentError, match="calibrate composites nothing: beside it there is a report only"):
+            rdstitch.calibrate(images, beside=beside)

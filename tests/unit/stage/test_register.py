@@ -28,6 +28,26 @@ from rdstitch.stage.phase_correlation import correlate
 from rdstitch.stage.positions import Scan, grid_from_names, grid_from_table, grid_from_tiles
 
 
+@pytest.mark.parametrize(("side", "degrees"), [(3, 0.0), (20, 2.3), (60, 0.8), (20, -15.0)])
+def test_a_stage_turned_to_the_camera_has_its_rows_and_columns(side: int, degrees: float) -> None:
+    columns, rows = (each.ravel() for each in np.meshgrid(np.arange(side), np.arange(side)))
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    off = np.random.default_rng(0).normal(0.0, 8.0, (side**2, 2))
+    places = np.stack([columns * 900.0, rows * 700.0], axis=1) @ np.array([[c, s], [-s, c]]) + off
+    grid = TileGrid(places, (1000, 800))
+    np.testing.assert_array_equal(grid.rows, rows)
+    np.testing.assert_array_equal(grid.columns, columns)
+
+
+@pytest.mark.parametrize("page", [0, 1])
+def test_a_flat_field_is_finite_and_its_page_is_named(tmp_path: Path, page: int) -> None:
+    pages = [np.ones((4, 6), np.float32), np.zeros((4, 6), np.float32)]
+    pages[page][0, 0] = np.nan
+    tifffile.imwrite(tmp_path / "f.tif", np.stack(pages), photometric="minisblack")
+    with pytest.raises(InputError, match=f"page {page + 1} has values that are not finite"):
+        read_flat_field(tmp_path / "f.tif", (6, 4), 1)
+
+
 @pytest.mark.parametrize(
     ("specimen", "rows", "tile", "seed"),
     [("fluorescence", 7, 256, 1), ("brightfield", 7, 256, 1), ("fluorescence", 5, 512, 301)],
