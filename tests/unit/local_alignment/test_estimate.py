@@ -76,8 +76,10 @@ def test_what_is_no_field_is_refused() -> None:
         DisplacementField(SIZE, np.zeros((3, 3)))
     with pytest.raises(ArgumentError, match="finite"):
         DisplacementField(SIZE, np.full((3, 3, 2), np.nan))
-    with pytest.raises(ArgumentError, match="at least one cell"):
-        align_locally([], CAMERAS, np.zeros((6, 3, 3)), choice=0)
+    wrong: Any
+    for wrong in (0, "on", True, 2.5):
+        with pytest.raises(ArgumentError, match=f"at least one, not {wrong!r}"):
+            align_locally([], [Camera(SIZE)], np.eye(3)[None], wrong)
 
 
 def test_of_an_image_one_pixel_wide_there_is_a_field() -> None:
