@@ -14,7 +14,7 @@ from rdstitch.alignment.cycle_consistency import misfitting_links
 from rdstitch.alignment.least_squares.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.geometry.nearest_points import nearest_points
+from rdstitch.geometry.nearest_points import SAME_FEATURE, separate_neighbours
 from rdstitch.robust.posterior import Evidence, overlap_cells
 
 _CELLS = (2, 3, 4)  # cells per side of a link's overlap within which errors are added up; the worst counts
@@ -27,8 +27,7 @@ LARGE_RELIEF = 0.00075
 
 _MAX_SAMPLES = 200_000  # correspondences of which the agreement is measured
 
-_MIN_DISTANCE, _MAX_DISTANCE = 0.005, 0.25
-"""Half diagonals between neighbours; nearer points are the same feature found twice."""
+_MAX_DISTANCE = 0.25  # half diagonals between neighbours
 
 
 @dataclass(frozen=True)
@@ -75,10 +74,8 @@ def neighbours(observations: Observations, inliers: BoolArray) -> tuple[IntArray
     spaced = np.column_stack([observations.points1[chosen], observations.link[chosen] * 10.0])
     if len(spaced) < 2:
         return chosen[:0], chosen[:0]
-    distance, neighbour = nearest_points(spaced, spaced, 4)
-    pairs = (distance[:, 1:] > _MIN_DISTANCE) & (distance[:, 1:] < _MAX_DISTANCE)
-    has_neighbour = pairs.any(axis=1)
-    nearest = neighbour[np.arange(len(spaced)), np.argmax(pairs, axis=1) + 1]
+    distance, nearest = separate_neighbours(spaced)
+    has_neighbour = (distance > SAME_FEATURE) & (distance < _MAX_DISTANCE)
     return chosen[has_neighbour], chosen[nearest[has_neighbour]]
 
 

@@ -6,7 +6,11 @@ import numpy as np
 from rdstitch.arrays import FloatArray, IntArray
 
 _SINGLE_TREE: dict[str, bool | int | float | str] = {"algorithm": 4}  # FLANN_INDEX_KDTREE_SINGLE
+_NEAREST = 3  # other points among which a separate one is looked for
 _EXACT: dict[str, bool | int | float | str] = {"checks": -1}
+
+SAME_FEATURE = 0.005
+"""Half diagonals: points of an image that are nearer are the same feature found twice, with the same error."""
 
 
 def nearest_points(points: FloatArray, queries: FloatArray, count: int) -> tuple[FloatArray, IntArray]:
@@ -21,3 +25,15 @@ def nearest_points(points: FloatArray, queries: FloatArray, count: int) -> tuple
         np.ascontiguousarray(queries - centre, np.float32), min(count, len(points)), params=_EXACT
     )
     return np.sqrt(squared, dtype=np.float64), indices.astype(np.intp)
+
+
+def separate_neighbours(points: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Of each point the nearest other one that is not the same feature, for how much the errors of neighbours agree.
+
+    Of ``points`` (N, D), in half diagonals: distances and indices, both (N,). Where all of the three nearest are the
+    same feature, the farthest of these, no farther than :data:`SAME_FEATURE`; the point itself where there is no other.
+    """
+    distance, index = nearest_points(points, points, _NEAREST + 1)
+    first = (distance > SAME_FEATURE).argmax(axis=1)
+    chosen = np.arange(len(points)), np.where(distance[:, -1] > SAME_FEATURE, first, -1)
+    return distance[chosen], index[chosen]

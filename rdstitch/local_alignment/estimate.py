@@ -89,8 +89,8 @@ def align_locally(
     each on the plane, and how high above it, in its unit. What heights of the ground explain is not left to fields of
     single images then.
     """
-    if choice != "auto" and choice < 1:
-        raise ArgumentError(f"local alignment takes at least one cell, not {choice}")
+    if choice != "auto" and (type(choice) is not int or choice < 1):
+        raise ArgumentError(f"local alignment takes 'auto' or a whole number of cells, at least one, not {choice!r}")
     images = ImagesOnSurface.of(cameras, homographies, on_sphere=on_sphere)
     if pairs is None:
         matches = list(matches)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, Rows
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.nearest_points import nearest_points
+from rdstitch.geometry.nearest_points import separate_neighbours
 from rdstitch.geometry.radial_homography import from_directions, from_plane, to_directions, to_plane
 from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.system.late_imports import csgraph, sparse
@@ -80,6 +80,7 @@ class PlacedMatches(Rows):
     images: NDArray[np.intp]  # (M, 2): the two images of each match
     points: FloatArray  # (M, 2, 2): measured pixels in either
     places: FloatArray  # (M, 2, D): where the alignment puts either
+    scale: FloatArray  # (M,): half the diagonal of the first image, pixels
 
     def __len__(self) -> int:
         return len(self.images)
@@ -87,7 +88,7 @@ class PlacedMatches(Rows):
     @classmethod
     def join(cls, parts: Iterable[Self]) -> Self:
         """All of them, one after the other."""
-        none = cls(np.empty((0, 2), np.intp), np.empty((0, 2, 2)), np.empty((0, 2, 2)))
+        none = cls(np.empty((0, 2), np.intp), np.empty((0, 2, 2)), np.empty((0, 2, 2)), np.empty(0))
         return cls.concatenate(list(parts) or [none])
 
     @cached_property
@@ -128,13 +129,13 @@ class PlacedMatches(Rows):
 
     @cached_property
     def neighbours(self) -> NDArray[np.intp]:
-        """For each match the nearest other one of the same pair of images; itself where there is none."""
+        """For each match the nearest one of another feature of the same pair of images; itself where there is none."""
         new_pair = (self.images[1:] != self.images[:-1]).any(axis=1)
         first = np.concatenate([[0], np.flatnonzero(new_pair) + 1, [len(self)]])
         nearest_other = np.empty(len(self), dtype=np.intp)
         for start, stop in pairwise(first.tolist()):
-            points = self.points[start:stop, 0]
-            nearest_other[start:stop] = start + nearest_points(points, points, 2)[1][:, -1]
+            points = self.points[start:stop, 0] / self.scale[start:stop, None]
+            nearest_other[start:stop] = start + separate_neighbours(points)[1]
         return nearest_other
 
     @cached_property
@@ -160,4 +161,5 @@ def place_matches(matches: Iterable[Match], images: ImagesOnSurface) -> Iterator
         radius = _SEARCH_RADIUS * min(2.0 * images.cameras[k].scale for k in pair)
         near = np.linalg.norm(placed[:, 0] - placed[:, 1], axis=1) < radius
         if (count := int(near.sum())) >= _MIN_MATCHES:
-            yield PlacedMatches(np.tile(np.array(pair), (count, 1)), measured[near], placed[near])
+            scale = np.full(count, images.cameras[match.image1].scale)
+            yield PlacedMatches(np.tile(np.array(pair), (count, 1)), measured[near], placed[near], scale)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.geometry.nearest_points import nearest_points
+from rdstitch.geometry.nearest_points import SAME_FEATURE, separate_neighbours
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.robust.levenberg_marquardt import descend
 from rdstitch.robust.measurements import Measurements
@@ -65,9 +65,11 @@ def estimate_per_image_distortion(
 
 
 def _coherence(points: FloatArray, errors: FloatArray) -> float:
-    """Correlation of the errors (N, 2) of points (N, 2) and their nearest neighbours."""
+    """Correlation of the errors (N, 2) of points (N, 2), half diagonals, and their nearest neighbours."""
     if len(points) < 2:
         return 0.0
-    nearest = nearest_points(points, points, 2)[1][:, 1]
+    distance, nearest = separate_neighbours(points)
+    separate = distance > SAME_FEATURE
+    errors, other = errors[separate], errors[nearest[separate]]
     power = float(np.einsum("ni,ni->", errors, errors))
-    return float(np.einsum("ni,ni->", errors, errors[nearest])) / power if power > 0.0 else 0.0
+    return float(np.einsum("ni,ni->", errors, other)) / power if power > 0.0 else 0.0

@@ -12,7 +12,7 @@ from rdstitch.geometry import division_model
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.conjugate_gradients import conjugate_gradients
 from rdstitch.geometry.division_model import distort, horizon_radius, nearest_one_parameter, undistort, valid_radius
-from rdstitch.geometry.nearest_points import nearest_points
+from rdstitch.geometry.nearest_points import nearest_points, separate_neighbours
 from rdstitch.geometry.planar_motion import PlanarMotion
 from rdstitch.geometry.radial_homography import (
     RadialHomography,
@@ -241,3 +241,13 @@ def test_the_nearest_points_are_those_of_all_distances(points: int, queries: int
     expected = np.sort(np.linalg.norm(asked[:, None] - places, axis=2), axis=1)[:, :4]
     np.testing.assert_allclose(distances, expected, atol=1e-4)
     np.testing.assert_allclose(np.linalg.norm(asked[:, None] - places[indices], axis=2), expected, atol=1e-4)
+
+
+@pytest.mark.parametrize(("twins", "found"), [(0, True), (1, True), (2, True), (3, False)])
+def test_a_feature_that_is_found_several_times_is_no_neighbour_of_itself(twins: int, found: bool) -> None:
+    places = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
+    several = np.concatenate([places + 1e-3 * k * np.array([1.0, -1.0]) for k in range(twins + 1)])
+    distance, index = separate_neighbours(several)
+    assert (distance > 0.005).all() == found
+    assert (index % 100 != np.arange(len(several)) % 100).all() == found
+    assert separate_neighbours(places[:1])[1].tolist() == [0]

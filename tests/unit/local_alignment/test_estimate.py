@@ -19,11 +19,14 @@ from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source
 from rdstitch.io import DecodedImage, Metadata
 from rdstitch.local_alignment import DisplacementField, LocalAlignment, Match, align_locally, estimate, fit
+from rdstitch.local_alignment.estimate import _agreement_of_neighbours
 from rdstitch.local_alignment.field import grid_shape, node_points
 from rdstitch.local_alignment.fit import Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches, place_matches
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.pipeline.lay_out import align_registration_locally
+from rdstitch.robust.loss import RAYLEIGH_MEDIAN
+from rdstitch.robust.per_image_distortion import _coherence
 from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
 from tests.registrations import registration
 
@@ -73,8 +76,10 @@ def test_what_is_no_field_is_refused() -> None:
         DisplacementField(SIZE, np.zeros((3, 3)))
     with pytest.raises(ArgumentError, match="finite"):
         DisplacementField(SIZE, np.full((3, 3, 2), np.nan))
-    with pytest.raises(ArgumentError, match="at least one cell"):
-        align_locally([], CAMERAS, np.zeros((6, 3, 3)), choice=0)
+    wrong: Any
+    for wrong in (0, "on", True, 2.5):
+        with pytest.raises(ArgumentError, match=f"at least one, not {wrong!r}"):
+            align_locally([], [Camera(SIZE)], np.eye(3)[None], wrong)
 
 
 def test_of_an_image_one_pixel_wide_there_is_a_field() -> None:
@@ -483,3 +488,16 @@ def test_a_bend_is_the_distance_from_a_straight_line() -> None:
     )
     ends = np.array([[(119.5, 200.0), (519.5, 200.0)], [(300.0, 40.0), (300.0, 440.0)]])
     np.testing.assert_allclose(bow.bends(ends), [4.0, 0.0], atol=0.05)
+
+
+@pytest.mark.parametrize("twins", [0, 40, 200])
+def test_noise_of_features_that_are_found_twice_is_noise(twins: int) -> None:
+    rng = np.random.default_rng(0)
+    points, noise = rng.uniform(0.0, 1000.0, (400, 2)), rng.normal(0.0, 0.5, (400, 2))
+    points[:twins] = points[twins : 2 * twins] + 1.0
+    noise[:twins] = noise[twins : 2 * twins]
+    placed = np.stack([points, points + noise], axis=1)
+    matches = PlacedMatches(np.tile([0, 1], (400, 1)), placed, placed, np.full(400, 700.0))
+    assert abs(_agreement_of_neighbours(matches)) < 0.1
+    assert matches.noise == pytest.approx(0.5 * RAYLEIGH_MEDIAN, rel=0.1)
+    assert abs(_coherence(points / 700.0, noise)) < 0.1
