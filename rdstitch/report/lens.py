@@ -93,8 +93,8 @@ def votes(registration: Registration) -> str:
     relations = [pair.relation for pair in registration.pairs if pair.relation]
     consensus = vote([r.distortion for r in relations], [r.distortion_std for r in relations])
     if not len(consensus.votes):
-        why = "the camera hardly moves, or only turns about its axis"
-        return section("Votes on λ", f"No pair voted: none of {len(relations)} can see the distortion: {why}.")
+        where = "as where a camera hardly moves, or only turns about its axis"
+        return section("Votes on λ", f"No pair voted: none of {len(relations)} can see the distortion, {where}.")
     agree = f"{int(consensus.agreeing.sum())} of them agree on {consensus.distortion:+.4f}"
     return section(
         "Votes on λ",

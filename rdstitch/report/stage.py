@@ -57,8 +57,8 @@ def _lines(tiled: TileRegistration, number: IntArray, off: FloatArray) -> list[t
     lines: list[tuple[str, ...]] = []
     for line in range(len(off)):
         links_of_line = agreeing & ((first == line) | (second == line))
-        rms = f"{math.sqrt(float(np.median(squared[links_of_line]))):.3f}" if links_of_line.any() else "none"
+        error = f"{math.sqrt(float(np.median(squared[links_of_line]))):.3f}" if links_of_line.any() else "none"
         here = number == line
         x, y = off[line].tolist()
-        lines.append((str(line), f"{int(tiled.linked[here].sum())} of {int(here.sum())}", f"{x:.2f}, {y:.2f}", rms))
+        lines.append((str(line), f"{int(tiled.linked[here].sum())} of {int(here.sum())}", f"{x:.2f}, {y:.2f}", error))
     return lines

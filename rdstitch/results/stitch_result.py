@@ -97,7 +97,9 @@ class OutputImage:
         """In RGB order."""
         if self.composite is not None:
             return self.composite.pixels, self.composite.alpha
-        if self.plan is not None or self.output is None or self.output.suffix.lower() in (".dzi", ".zarr"):
+        if self.plan is not None:
+            raise ArgumentError("a dry run makes no image")
+        if self.output is None or self.output.suffix.lower() in (".dzi", ".zarr"):
             raise ArgumentError("there is no image in memory: stitch without an output, or with one of another type")
         image = read_image(self.output)
         return image.pixels, image.alpha

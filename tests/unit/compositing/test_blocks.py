@@ -184,7 +184,10 @@ def test_a_composer_by_a_result_and_by_its_sidecar(tmp_path: Path) -> None:
     assert np.abs(found.astype(float) - result.image)[first.alpha > 0].mean() < 3.0
     with pytest.raises(ArgumentError, match="uint8, uint16 or float32"):
         first.compose([image.astype(np.float64) for image in images])
-    again = Composer(apply(tmp_path / "pano.png.json", images, dry_run=True))
+    dry = apply(tmp_path / "pano.png.json", images, dry_run=True)
+    with pytest.raises(ArgumentError, match="a dry run makes no image"):
+        _ = dry.image
+    again = Composer(dry)
     # The whole canvas, where the sidecar's one was cropped.
     assert again.compose(images).shape[2] == 3
     assert again.alpha.size >= first.alpha.size
