@@ -29,6 +29,7 @@ from rdstitch.synthetic import (
     pair_poses,
     sequence_over,
 )
+from rdstitch.synthetic.textures import LAYER_PERIODS
 
 SIZE = (320, 240)
 LENSES: list[Lens] = [
@@ -214,11 +215,18 @@ def test_endless_ground_is_the_same_wherever_it_is_cut() -> None:
     whole = texture.region(70_000, 30_000, 70_300, 30_200)
     np.testing.assert_array_equal(texture.region(70_100, 30_050, 70_200, 30_150), whole[50:150, 100:200])
     assert 0.05 < whole.std() < 0.4
-    period = texture.region(70_000 + 2039, 30_000, 70_300 + 2039, 30_200)
-    assert abs(np.corrcoef(whole.ravel(), period.ravel())[0, 1]) < 0.75
-    seam = texture.region(2039 - 8, 0, 2039 + 8, 2000).mean(axis=2)
+    for period in LAYER_PERIODS:
+        moved = texture.region(70_000 + period, 30_000, 70_300 + period, 30_200)
+        assert abs(np.corrcoef(whole.ravel(), moved.ravel())[0, 1]) < 0.75
+    seam = texture.region(LAYER_PERIODS[0] - 8, 0, LAYER_PERIODS[0] + 8, 2000).mean(axis=2)
     steps = np.abs(np.diff(seam, axis=1)).mean(axis=0)
     assert steps[7] < 2.0 * np.median(steps)
+
+
+def test_layers_of_endless_ground_do_not_nearly_coincide_elsewhere() -> None:
+    shift = np.arange(min(LAYER_PERIODS) // 2, 100_000)
+    apart = np.max([np.minimum(shift % period, -shift % period) for period in LAYER_PERIODS], axis=0)
+    assert apart.min() > 100
 
 
 DOWNWARDS = Camera((320, 240), -0.2, focal=260.0)
