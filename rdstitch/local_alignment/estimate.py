@@ -20,7 +20,7 @@ from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatch
 # which the finer one is coarser for more than some 70 images, and both for more than 800.
 _COARSE, _FINE = (12, 120_000), (24, 40_000)
 _SLOPES = (0.2, 0.06, 0.02)
-_SLOPE_OF_GROUND = 0.5  # one surface for all images: many matches determine it, and it may be freer
+_SLOPES_OF_GROUND = (0.5, 0.2, 0.06)  # one surface for all images, which many matches determine, may be freer
 _HELD_OUT = 5  # every fifth track: a keypoint brings its error to all its matches, fitted or not
 _WORTHWHILE = 0.15  # share by which what a person sees must get less for local alignment to be worth while
 # A person sees edges that do not go on across seams, as far as this percentile of the held-out residuals, and straight
@@ -111,13 +111,19 @@ def align_locally(
     worthwhile = (1.0 - _WORTHWHILE) * _seam_residual(tested.residual)
     limit = worthwhile if choice == "auto" else math.inf
     straight = cache(lambda: _long_edges(edges, cameras))
-    base = None
-    if centers is not None:
-        stiffness = Stiffness(cells, _SLOPE_OF_GROUND)
-        ground = fit_ground(fitted, images, images.scale * centers, stiffness).fields(images, stiffness)
-        cost = _seam_residual(tested.residual_with(ground.delivered, images))
-        if cost <= worthwhile and cost + _bend(ground.delivered, straight()) <= worthwhile:
-            base = ground
+    base = ground = None
+    for slope in _SLOPES_OF_GROUND:
+        if centers is None:
+            break
+        part = _ground(fitted, images, centers, Stiffness(cells, slope))
+        cost = _seam_residual(tested.residual_with(part.delivered, images))
+        if cost > worthwhile:
+            continue
+        # Of all matches, as it is delivered: bends without a fifth of them depend on which fifth it is.
+        whole = _ground(placed, images, centers, part.stiffness)
+        if cost + _bend(whole.delivered, straight()) <= worthwhile:
+            base, ground, limit = part, whole, math.inf
+            break
     candidates = list(_candidates(fitted, tested, images, min(coarse, cells), cells, base))
     costs = [_seam_residual(candidate.residual) for candidate in candidates]
     if min(costs) <= limit:
@@ -129,12 +135,17 @@ def align_locally(
     )
     if min(costs) > limit:
         return LocalAlignment((), f"not worth while; {text}", before=before, after=after)
-    if base is not None:
+    if ground is not None:
         text += ", mostly by the height of the ground"
     if choice not in ("auto", cells):
         text += f"; a grid of {cells} instead of {choice} cells, the finest that so many images may have"
-    final = fit_fields(placed, images, best.fit.stiffness, best.fit, base)
-    return LocalAlignment(final.delivered, text, cells, base is not None, before, after)
+    final = fit_fields(placed, images, best.fit.stiffness, best.fit, ground)
+    return LocalAlignment(final.delivered, text, cells, ground is not None, before, after)
+
+
+def _ground(matches: PlacedMatches, images: ImagesOnSurface, centers: FloatArray, stiffness: Stiffness) -> PlacedFields:
+    """What heights of the ground displace."""
+    return fit_ground(matches, images, images.scale * centers, stiffness).fields(images, stiffness)
 
 
 class _Candidate(NamedTuple):

@@ -193,6 +193,38 @@ def test_of_cameras_whose_places_are_known_images_show_the_ground_from_above(
     assert np.nanmedian(errors["ground"]) < 0.15 * np.nanmedian(errors["plane"])
 
 
+placed_tracks: Any = PlacedMatches.__dict__["tracks"].func
+
+
+def test_which_tracks_are_held_out_does_not_change_how_far_the_ground_bends_edges(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A bend is that of few edges: without a fifth of the matches it differs by the noise of a field."""
+    sequence = scene("slopes", 0.05, overlap=0.6)
+    found, first = matches(sequence, noise=1.0), []
+    tracks = [placed_tracks, lambda placed: placed_tracks(placed) + 1]
+    for numbered in tracks:
+        judged: list[FloatArray] = []
+
+        def bend(fields: Any, edges: Any, judged: list[FloatArray] = judged) -> float:
+            judged.append(fields[2].values)
+            return 0.0
+
+        monkeypatch.setattr(estimate, "_bend", bend)
+        monkeypatch.setattr(PlacedMatches, "tracks", property(numbered))
+        assert align_locally(found, CAMERAS, homographies(sequence), centers=centers(sequence)).by_heights
+        first.append(judged[0])
+    np.testing.assert_array_equal(first[0], first[1])
+
+
+def test_where_the_freest_ground_bends_edges_a_stiffer_one_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    sequence = scene("slopes", 0.05, overlap=0.6)
+    bends = [9.0]
+    monkeypatch.setattr(estimate, "_bend", lambda fields, edges: bends.pop() if bends else 0.0)
+    local = align_locally(matches(sequence), CAMERAS, homographies(sequence), centers=centers(sequence))
+    assert local.by_heights
+
+
 @pytest.mark.parametrize("level", [0.0, -20.0])
 def test_what_lies_far_off_the_plane_is_reached(level: float) -> None:
     # The alignment is that of the valleys, or lower: most residuals are many times their noise.
