@@ -26,9 +26,7 @@ _OUTLYING = 8.0  # times what is usual from which on a triangle does not close, 
 _VISIBLE, _MIN_VISIBLE = 1.5, 2
 """Half diagonals from the middle up to which a transferred probe counts, and so many probes at least of a triangle."""
 
-_MIN_ERROR, _MAX_ERROR = 0.02, 0.1
-"""Half diagonals: a link that is off by less is no wrong pair; one that is off by more is, whatever the others are off
-by. Matches at random leave 0.2 (eight of them) to 0.8, whichever model is adjusted to them (72 times)."""
+_MIN_ERROR = 0.02  # half diagonals: a link that is off by less is no wrong pair
 
 
 def triangles(count: int, image1: IntArray, image2: IntArray) -> IntArray:
@@ -174,8 +172,8 @@ def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArr
     """
     typical = observations.medians(np.sqrt(squared))
     usual = _weighted_median(typical, np.where(np.isfinite(typical), observations.matches, 0))
-    scale = np.sqrt(observations.scale1 * observations.scale2)
-    outlying: BoolArray = ~(typical <= np.clip(_OUTLYING * usual, _MIN_ERROR * scale, _MAX_ERROR * scale))
+    tolerance = _MIN_ERROR * np.sqrt(observations.scale1 * observations.scale2)
+    outlying: BoolArray = ~(typical <= np.maximum(_OUTLYING * usual, tolerance))
     return outlying
 
 
