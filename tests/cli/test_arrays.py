@@ -190,5 +190,5 @@ def test_what_a_notebook_shows(of_files: rdstitch.StitchResult) -> None:
         [source.path for source in of_files.registration.sources], options=rdstitch.StitchOptions(dry_run=True)
     )
     assert planned._repr_png_() is None
-    with pytest.raises(ArgumentError, match="no image in memory"):
+    with pytest.raises(ArgumentError, match="a dry run makes no image"):
         _ = planned.image
