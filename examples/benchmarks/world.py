@@ -49,7 +49,7 @@ class Peer:
     def __str__(self) -> str:
         """The end of a line of the table."""
         longest = max((one.length for one in self.seams.breaks), default=0.0)
-        share = self.seams.share if len(self.seams.places) else math.nan
+        share = self.seams.broken_fraction if len(self.seams.places) else math.nan
         return f" {self.used:5d} {100 * share:5.1f} {longest:5.0f} {self.seconds:7.1f}"
 
 

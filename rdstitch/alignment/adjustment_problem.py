@@ -138,8 +138,8 @@ class Problem(LinkProblem):
             adjusted = adjuster.run(at, wide_start=True)
             scales, changed = self._rescaled(scales, adjusted, rounds)
             if not changed:
-                own_tilts = scales.tilt_spread if model.free_tilts else None
-                return Fit(model, adjusted, own_tilts)
+                tilt_spread_used = scales.tilt_spread if model.free_tilts else None
+                return Fit(model, adjusted, tilt_spread_used)
             at = adjusted.parameters
         raise AssertionError("scales settle")
 

@@ -59,8 +59,9 @@ class AlignmentOptions:
         if self.max_matches_per_link < FEWEST_MATCHES:
             raise ArgumentError(f"max_matches_per_link must be at least {FEWEST_MATCHES}")
         names, places, stds = ([getattr(one, of) for one in self.control] for of in ("name", "place", "std"))
-        if (found := contradicting_places(names, places, stds)) is not None:
-            raise ArgumentError(f"control point {names[found[0]]} has two places, {found[2]:.3g} m apart")
+        if (contradiction := contradicting_places(names, places, stds)) is not None:
+            point, _, distance = contradiction
+            raise ArgumentError(f"control point {names[point]} has two places, {distance:.3g} m apart")
 
     def exact_tilts(self, count: int) -> list[tuple[float, float]] | None:
         """(ψ, θ), radians, of each of ``count`` images, where they are known exactly; None where not."""

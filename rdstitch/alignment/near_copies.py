@@ -72,18 +72,20 @@ def with_near_copies(
         for name in ("yaw", "position", "height", "tilt"):
             getattr(result.poses, name)[rows] = getattr(placed, name)[copies]
         if result.poses.covariance is not None:  # a copy is as uncertain as its image, and as where it lies beside that
-            own = adjuster.normal_equations(adjusted).pose_covariances()[0][copies]
-            moved = pose_jacobian(model, adjusted.parameters.poses, start.shared, reference)[copies, :, : own.shape[1]]
-            result.poses.covariance[rows] += moved @ own @ moved.swapaxes(1, 2)
+            covariance = adjuster.normal_equations(adjusted).pose_covariances()[0][copies]
+            moved = pose_jacobian(model, adjusted.parameters.poses, start.shared, reference)[
+                copies, :, : covariance.shape[1]
+            ]
+            result.poses.covariance[rows] += moved @ covariance @ moved.swapaxes(1, 2)
     return result
 
 
 def _tilted(fit: Fit, rows: IntArray, by: FloatArray) -> FloatArray:
     """The poses that come nearest to those of a fit in some rows, and are tilted by so much (C, 2) more, radians."""
-    model, found = fit.model, fit.adjusted.parameters
-    poses = found.poses[rows]
+    model, parameters = fit.model, fit.adjusted.parameters
+    poses = parameters.poses[rows]
     if not model.has_metric_poses:
         return poses
-    tilts = model.metric_poses(poses, found.shared)[:, [PSI, THETA]] + by
-    tilts -= model.physical_parameters(found.shared)[0][:2]
-    return model.nearest_poses(fit.adjusted.matrices.matrices[rows], found.shared, tilts)
+    tilts = model.metric_poses(poses, parameters.shared)[:, [PSI, THETA]] + by
+    tilts -= model.physical_parameters(parameters.shared)[0][:2]
+    return model.nearest_poses(fit.adjusted.matrices.matrices[rows], parameters.shared, tilts)

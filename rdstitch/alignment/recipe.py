@@ -80,7 +80,7 @@ class AlignmentTask(GivenImages):
         return result
 
     @property
-    def found(self) -> KnownModel | None:
+    def draft_model(self) -> KnownModel | None:
         """The model of the draft, for one by more links to start from, if it can."""
         return KnownModel.of(self._selected)
 

@@ -69,12 +69,14 @@ def map_contradicted(places: str, distance: float | None, growth: float) -> Mess
 
 def relief_explained(left: Coherence, model: MotionModel, links: int) -> str:
     """What the agreement of neighbours that a model leaves means for the scene."""
-    found = shows_relief(left)
+    significant = shows_relief(left)
     agreement = f"errors of neighbours agree (correlation {left.correlation:.2f}, {left.size:.1f} pixels in common)"
     if model.on_sphere:
         moved = "the camera moved between the images (parallax): what is near does not fit; turn about the lens"
-        return f"{agreement}: {moved}" if found else f"the camera hardly moved (correlation {left.correlation:.2f})"
-    if found:
+        return (
+            f"{agreement}: {moved}" if significant else f"the camera hardly moved (correlation {left.correlation:.2f})"
+        )
+    if significant:
         wrong = f"the scene is not one plane, or the {model.name} model does not describe the camera; λ may be off"
         return f"{agreement}: {wrong}"
     if left.correlation > COHERENT_CORRELATION:

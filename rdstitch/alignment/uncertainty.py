@@ -134,8 +134,8 @@ def _by_keypoints(observations: Observations, influence: FloatArray) -> FloatArr
         sides, links = np.divmod(ends, len(observations))
         rows = [np.arange(observations.start[link], observations.start[link + 1]) for link in links.tolist()]
         points = [
-            (observations.points2 if side else observations.points1)[own_rows]
-            for side, own_rows in zip(sides.tolist(), rows, strict=True)
+            (observations.points2 if side else observations.points1)[of_link]
+            for side, of_link in zip(sides.tolist(), rows, strict=True)
         ]
         if not points:
             continue
@@ -248,7 +248,7 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
         problem = replace(problem, free_lens=np.ones_like(problem.free_lens))
     adjuster, model, parameters = problem.adjuster_of(fit), fit.model, fit.adjusted.parameters
     normal, (count, size) = adjuster.normal_equations(fit.adjusted), adjuster.free.poses.shape
-    own, by_shared, of_shared = normal.pose_covariances()
+    of_pose, by_shared, of_shared = normal.pose_covariances()
     of_first = np.zeros((count, size, size))
     of_first[0] = np.eye(size)
     first = normal.responses(-of_first, np.zeros((len(of_shared), size)))[0]
@@ -269,7 +269,7 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
     )
     by_shared_steps = np.broadcast_to(steps_of_shared, (count, *steps_of_shared.shape))
     moved = jacobian @ np.concatenate([steps_of_poses, by_shared_steps], axis=1)
-    of_images = jacobian @ joint(own, by_shared) @ jacobian.transpose(0, 2, 1)
+    of_images = jacobian @ joint(of_pose, by_shared) @ jacobian.transpose(0, 2, 1)
     with_first = jacobian @ joint(first, np.broadcast_to(by_shared[0], by_shared.shape)) @ jacobian[0].T
     return of_images + moved @ moved.transpose(0, 2, 1), with_first + moved @ moved[0].T
 

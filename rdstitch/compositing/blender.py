@@ -67,7 +67,7 @@ class MultibandBlender:
         ``pixels`` is used up.
         """
         level = rounded(pixels, self.constant)
-        share = np.ceil(weight * _WEIGHT_STEPS) / _WEIGHT_STEPS
+        weights = np.ceil(weight * _WEIGHT_STEPS) / _WEIGHT_STEPS
         x, y = box[0] - self.box[0], box[1] - self.box[1]
         for band in range(self.bands + 1):
             band_pixels = level
@@ -76,14 +76,14 @@ class MultibandBlender:
                 band_pixels = rounded(_up(coarser), self.constant)
                 np.subtract(level, band_pixels, out=band_pixels)
                 level = coarser
-            height, width = share.shape
+            height, width = weights.shape
             cut = np.s_[y >> band : (y >> band) + height, x >> band : (x >> band) + width]
-            band_pixels *= per_channel(share, self.channels)
+            band_pixels *= per_channel(weights, self.channels)
             self._sums[band][cut] += band_pixels
-            self._weights[band][cut] += share
+            self._weights[band][cut] += weights
             if band < self.bands:
                 # Rounded up: where a weight is not 0, it must not become 0.
-                share = np.ceil(_down(share[..., None])[..., 0] * _WEIGHT_STEPS) / _WEIGHT_STEPS
+                weights = np.ceil(_down(weights[..., None])[..., 0] * _WEIGHT_STEPS) / _WEIGHT_STEPS
 
     def result(self) -> Float32Array:
         """The blended samples (h, w, C); meaningless near the box' border and where no weight was."""

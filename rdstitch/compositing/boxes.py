@@ -80,19 +80,19 @@ def overlapping_pairs(boxes: Sequence[Box | None], most: int = _MAX_NEIGHBOURS) 
     order = np.argsort(edges[:, along], kind="stable")
     present, edges = present[order], edges[order]
     place, last = np.arange(len(edges)), np.searchsorted(edges[:, along], edges[:, along + 2])
-    found = [np.zeros((2, 0), dtype=np.intp)]
+    overlaps = [np.zeros((2, 0), dtype=np.intp)]
     for part in np.split(place, np.arange(_BOXES_AT_ONCE, len(place), _BOXES_AT_ONCE)):
         later = last[part] - part - 1
         first = np.repeat(part, later)
         second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(later) - later, later)
-        found.append(np.stack([first, second])[:, (_sides(edges, first, second) > 0).all(axis=1)])
-    first, second = np.concatenate(found, axis=1)
+        overlaps.append(np.stack([first, second])[:, (_sides(edges, first, second) > 0).all(axis=1)])
+    first, second = np.concatenate(overlaps, axis=1)
     sides = _sides(edges, first, second)
     areas = (edges[:, 2:] - edges[:, :2]).prod(axis=1)
-    share = sides.prod(axis=1) / np.minimum(areas[first], areas[second])
+    fraction = sides.prod(axis=1) / np.minimum(areas[first], areas[second])
     pairs = np.sort(np.stack([present[first], present[second]], axis=1), axis=1)[:, ::-1]
     ascending = np.lexsort((pairs[:, 1], pairs[:, 0]))
-    return _largest(pairs[ascending], share[ascending], len(boxes), most)
+    return _largest(pairs[ascending], fraction[ascending], len(boxes), most)
 
 
 def _sides(edges: NDArray[np.intp], first: NDArray[np.intp], second: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -100,18 +100,18 @@ def _sides(edges: NDArray[np.intp], first: NDArray[np.intp], second: NDArray[np.
     return np.minimum(edges[first, 2:], edges[second, 2:]) - np.maximum(edges[first, :2], edges[second, :2])
 
 
-def _largest(pairs: NDArray[np.intp], share: FloatArray, count: int, most: int) -> NDArray[np.intp]:
+def _largest(pairs: NDArray[np.intp], fraction: FloatArray, count: int, most: int) -> NDArray[np.intp]:
     """The pairs of the largest shares, ``most`` of each image, and a spanning tree."""
     ends = pairs.T.ravel()
     degree = np.bincount(ends, minlength=count)
     if degree.max(initial=0) <= most:
         return pairs
-    ranked = np.lexsort((-np.tile(share, 2), ends))
+    ranked = np.lexsort((-np.tile(fraction, 2), ends))
     rank = np.arange(len(ends)) - np.repeat(np.cumsum(degree) - degree, degree)
     kept = np.zeros(len(pairs), dtype=np.bool_)
     kept[ranked[rank < most] % len(pairs)] = True
     # Weights above 0, smallest for the largest share.
-    weights = sparse.csr_array((2.0 - share, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    weights = sparse.csr_array((2.0 - fraction, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     tree = csgraph.minimum_spanning_tree(weights).tocoo()
     kept |= np.isin(pairs @ [count, 1], tree.row.astype(np.intp) * count + tree.col)
     return pairs[kept]

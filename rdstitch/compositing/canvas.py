@@ -23,7 +23,7 @@ from rdstitch.geometry.camera import Camera, points_over
 from rdstitch.geometry.radial_homography import to_directions, to_plane
 
 _MAX_GROWTH = 100.0
-_MAX_ENLARGEMENT = 400.0  # pixels of the canvas for each of the images, where --scale requests it
+_MAX_ENLARGEMENT = 400.0  # pixels of the canvas for each pixel of the images
 _LEVEL = 1e-9  # rounding of what a turn within the plane leaves as it is
 
 
@@ -107,8 +107,8 @@ class Canvas:
             points = points_over(camera.image_size, PROBES)
             part, places = self.near[k] if self.near else None, self.place(camera, matrix, points)
             with np.errstate(invalid="ignore"):
-                beside = (places < -1.0) | (places > np.array(self.size))
-                inside = np.isfinite(places).all(axis=1) & ~beside[:, 1 if self.period else 0 :].any(axis=1)
+                outside = (places < -1.0) | (places > np.array(self.size))
+                inside = np.isfinite(places).all(axis=1) & ~outside[:, 1 if self.period else 0 :].any(axis=1)
             drawn.append(inside if part is None else inside & part.shows(points))
         return 1.0 - float(np.mean(drawn))
 

@@ -100,10 +100,10 @@ def solve(
     normal = sparse.csr_array(weighted.T @ design + prior.precision)
     right = weighted.T @ values + prior.weighted_mean
     entries, block = normal.tocoo(), prior.block
-    own = entries.row // block == entries.col // block
-    row, column = entries.row[own], entries.col[own]
+    diagonal = entries.row // block == entries.col // block
+    row, column = entries.row[diagonal], entries.col[diagonal]
     blocks = np.zeros((len(right) // block, block, block))
-    blocks[row // block, row % block, column % block] = entries.data[own]
+    blocks[row // block, row % block, column % block] = entries.data[diagonal]
     inverse = np.linalg.inv(blocks)
 
     def of_images(left: FloatArray) -> FloatArray:

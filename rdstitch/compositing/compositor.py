@@ -24,7 +24,7 @@ from rdstitch.io.write import write_strips
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.results.messages import Message
 from rdstitch.system.outputs import Fingerprint, Outputs
-from rdstitch.system.progress import ShareProgress, unheard
+from rdstitch.system.progress import FractionProgress, no_progress
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -59,7 +59,7 @@ def compose(images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOpt
 
 
 def compose_decided(
-    decisions: Decisions, progress: ShareProgress = unheard, elsewhere: BlockRunner | None = None
+    decisions: Decisions, progress: FractionProgress = no_progress, elsewhere: BlockRunner | None = None
 ) -> Composite:
     """The same once exposure and seams are decided.
 
@@ -81,7 +81,7 @@ def compose_decided(
 def compose_to_file(
     path: str | Path,
     decisions: Decisions,
-    progress: ShareProgress = unheard,
+    progress: FractionProgress = no_progress,
     elsewhere: BlockRunner | None = None,
     *,
     metadata: Metadata | None = None,

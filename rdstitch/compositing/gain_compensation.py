@@ -32,7 +32,7 @@ from rdstitch.system.late_imports import sparse
 _SRGB_OFFSET = 0.055
 # The brightest thousandth may be brightened to where compression leaves three quarters of its contrast; beyond, images
 # follow their own brightness.
-_BRIGHTEST_SHARE, _MAX_WHITE = 0.999, KNEE + (1.0 - KNEE) / math.sqrt(0.75)
+_WHITE_QUANTILE, _MAX_WHITE = 0.999, KNEE + (1.0 - KNEE) / math.sqrt(0.75)
 _MEDIAN_SAMPLES = 10_000  # of all images together
 
 
@@ -82,18 +82,18 @@ def _without_burning(
 
     def white(log: FloatArray) -> float:
         done = (light * np.exp(-log - _common(light, log))).max(axis=1)[unclipped] - exposure.offset
-        return float(np.quantile(done, _BRIGHTEST_SHARE)) if len(done) else 1.0
+        return float(np.quantile(done, _WHITE_QUANTILE)) if len(done) else 1.0
 
     if (brightest := white(log)) <= _MAX_WHITE:
         return replace(exposure, white=max(brightest, 1.0))
     # What one image alone is brighter by is to vanish: neighbours count by the share that they have in common.
     around, gains = cells.overlap + sparse.eye_array(len(cameras)), exposure.log_gain + _common(light, log)
-    own = fit_own_brightness(cells, -(around @ gains) / around.sum(axis=1)[:, None], cameras, workers)
-    own_alone = replace(exposure, log_gain=np.zeros(gains.shape), vignetting=np.zeros(3), fields=own)
-    _, along = _samples(own_alone, survey, cameras)
-    share = next((s for s in np.linspace(0.0, 1.0, 17)[1:-1] if white(log + s * along) <= _MAX_WHITE), 1.0)
-    fields = share * own + (exposure.fields if exposure.fields.size else 0.0)
-    return replace(exposure, fields=fields, white=max(white(log + share * along), 1.0))
+    local_fields = fit_own_brightness(cells, -(around @ gains) / around.sum(axis=1)[:, None], cameras, workers)
+    local_only = replace(exposure, log_gain=np.zeros(gains.shape), vignetting=np.zeros(3), fields=local_fields)
+    _, along = _samples(local_only, survey, cameras)
+    amount = next((s for s in np.linspace(0.0, 1.0, 17)[1:-1] if white(log + s * along) <= _MAX_WHITE), 1.0)
+    fields = amount * local_fields + (exposure.fields if exposure.fields.size else 0.0)
+    return replace(exposure, fields=fields, white=max(white(log + amount * along), 1.0))
 
 
 def _samples(exposure: Exposure, survey: Survey, cameras: Sequence[Camera]) -> tuple[FloatArray, FloatArray]:

@@ -56,10 +56,10 @@ def interpolated(nodes: Float32Array, box: Box, step: int) -> Float32Array:
     """
     x0, y0, x1, y1 = box
     left, top = x0 % step, y0 % step
-    share = np.arange(step, dtype=np.float32) / np.float32(step)
+    fraction = np.arange(step, dtype=np.float32) / np.float32(step)
     rise = nodes[:, 1:] - nodes[:, :-1]
-    columns = (rise[..., None] * share + nodes[:, :-1, None]).reshape(len(nodes), -1)[:, left : left + x1 - x0]
-    values: Float32Array = (columns[1:] - columns[:-1])[:, None, :] * share[:, None]
+    columns = (rise[..., None] * fraction + nodes[:, :-1, None]).reshape(len(nodes), -1)[:, left : left + x1 - x0]
+    values: Float32Array = (columns[1:] - columns[:-1])[:, None, :] * fraction[:, None]
     values += columns[:-1, None, :]
     return np.asarray(values.reshape(-1, x1 - x0)[top : top + y1 - y0])
 

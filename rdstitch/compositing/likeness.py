@@ -27,7 +27,7 @@ def likeness(tiles: Sequence[SeamTile | None], pairs: IntArray, full: float = 25
     """Compare the overlaps of pairs (P, 2) in place, a few pixels more or less; see :class:`SeamQuality`."""
     small = [None if tile is None else _smaller(tile) for tile in tiles]
     textured = [0 if tile is None else int(_textured(tile.grey, tile.inside, full)[1].sum()) for tile in small]
-    found: dict[tuple[int, int], tuple[int, int]] = {}
+    counts_of_pairs: dict[tuple[int, int], tuple[int, int]] = {}
     shown = 0
     for i, j in pairs.tolist():
         first, second = small[i], small[j]
@@ -39,12 +39,12 @@ def likeness(tiles: Sequence[SeamTile | None], pairs: IntArray, full: float = 25
         known = known1 & known2
         alike = correlation(cells1[known], cells2[known]) > UNLIKE
         if len(alike) >= _MIN_CELLS:
-            found[min(i, j), max(i, j)] = len(alike), int(alike.sum())
+            counts_of_pairs[min(i, j), max(i, j)] = len(alike), int(alike.sum())
             shown += min(textured[i], textured[j])
-    if not found:
+    if not counts_of_pairs:
         return Likeness()
-    cells, alike_cells = (sum(counts) for counts in zip(*found.values(), strict=True))
-    worst = min(found, key=lambda pair: found[pair][1] / found[pair][0])
+    cells, alike_cells = (sum(counts) for counts in zip(*counts_of_pairs.values(), strict=True))
+    worst = min(counts_of_pairs, key=lambda pair: counts_of_pairs[pair][1] / counts_of_pairs[pair][0])
     return Likeness(alike_cells / cells, 1.0 - (cells - alike_cells) / max(shown, cells), worst)
 
 

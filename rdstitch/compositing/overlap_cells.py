@@ -82,14 +82,14 @@ def compare_overlaps(survey: Survey, workers: int = 1) -> Cells | None:
     """Compare all images that lie over each other, by so many threads; None where no two show the same."""
     pairs, count = survey.pairs(), len(survey.tiles)
     shown = {k: _Shown.of(tile) for k, tile in enumerate(survey.tiles) if tile is not None}
-    shares, found = np.zeros(len(pairs)), list[tuple[IntArray, FloatArray, FloatArray]]()
+    overlap_fractions, cells = np.zeros(len(pairs)), list[tuple[IntArray, FloatArray, FloatArray]]()
 
     def compared(first: int) -> list[tuple[IntArray, FloatArray, FloatArray]]:
         """The cells of some pairs."""
         of_pairs = []
         for index, (i, j) in enumerate(pairs[first : first + _PAIRS_AT_A_TIME].tolist(), start=first):
             _, _, box, seen = survey.overlap(i, j)
-            shares[index] = np.count_nonzero(seen) / min(shown[i].area, shown[j].area)
+            overlap_fractions[index] = np.count_nonzero(seen) / min(shown[i].area, shown[j].area)
             for middles, means in _cells_of_overlap(shown[i], shown[j], box):
                 every = max(1, -(-len(means) * len(pairs) // _MAX_CELLS))
                 of_pairs.append((np.full(len(means[::every]), index), middles[::every], means[::every]))
@@ -97,19 +97,19 @@ def compare_overlaps(survey: Survey, workers: int = 1) -> Cells | None:
 
     with ThreadPoolExecutor(workers) as pool:
         for of_pairs in pool.map(compared, range(0, len(pairs), _PAIRS_AT_A_TIME)):
-            found += of_pairs
-    if not any(len(of_pair) for of_pair, _, _ in found):
+            cells += of_pairs
+    if not any(len(of_pair) for of_pair, _, _ in cells):
         return None
-    pair, middles, means = (np.concatenate(each) for each in zip(*found, strict=True))
-    samples, clipped_share, moments = np.split(means, [-_CLIPPED - _MOMENTS, -_MOMENTS], axis=1)
+    pair, middles, means = (np.concatenate(each) for each in zip(*cells, strict=True))
+    samples, clipped_fraction, moments = np.split(means, [-_CLIPPED - _MOMENTS, -_MOMENTS], axis=1)
     full = full_scale(next(iter(shown.values())).tile.pixels.dtype)
     values = np.moveaxis(samples.reshape(len(means), 2, -1), 1, 0) / full
-    images, clipped, points = pairs[pair].T, clipped_share.T > 0.5, np.empty((2, len(pair), 2))
+    images, clipped, points = pairs[pair].T, clipped_fraction.T > 0.5, np.empty((2, len(pair), 2))
     evidence = _evidence(moments.T, np.asarray(clipped.any(axis=0)))
     for side, image, chosen in _by_image(images):
         points[side, chosen] = survey.warps[image].source_points(*middles[chosen].T)
     known = np.isfinite(points).all(axis=(0, 2))
-    overlap = sparse.csr_array((shares, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    overlap = sparse.csr_array((overlap_fractions, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     parts = (images[:, known], points[:, known], values[:, known], clipped[2:, known], evidence[known])
     return Cells(pair[known], *parts, sparse.csr_array(overlap + overlap.T))
 

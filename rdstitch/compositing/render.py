@@ -259,16 +259,16 @@ class Renderer:
             part = intersection(self.warps[index].box, box) if index != NO_OWNER else None
             if part is None or self.seams is None:
                 continue
-            share = self.seams.share(index, part)
-            if (shown := bounds(share, part)) is None:
+            weight = self.seams.weights(index, part)
+            if (shown := bounds(weight, part)) is None:
                 continue
             # Of many images that overlap each owns little of a tile; a view would hold the whole.
-            share, geometry = cut(share, part, shown).copy(), self._placed(index, shown, box)
+            weight, geometry = cut(weight, part, shown).copy(), self._placed(index, shown, box)
             if not geometry.filled:
-                share[~geometry.inside] = 0.0
+                weight[~geometry.inside] = 0.0
             if (opacity := self._opacity(index, geometry)) is not None:
-                share[opacity == 0] = 0.0
-            if (layer := Layer(index, shown, share, geometry).weighted_part(shown)) is not None:
+                weight[opacity == 0] = 0.0
+            if (layer := Layer(index, shown, weight, geometry).weighted_part(shown)) is not None:
                 yield layer
 
 

@@ -28,7 +28,7 @@ NO_OWNER = -1
 
 # Band in which a seam may wander: the new image's share of both border weights. Its edges count as such a difference of
 # brightness: where nothing differs, a seam keeps to the middle, and what moves is gone round on either side.
-_MIN_SHARE, _MAX_SHARE, _ASIDE = 0.1, 0.9, 0.04
+_MIN_WEIGHT, _MAX_WEIGHT, _ASIDE = 0.1, 0.9, 0.04
 _AROUND_FREE = 2
 _AHEAD = 4  # images that are prepared before their cuts
 # What a difference of edges, a pixel, counts beside one of brightness, and the root of the largest cost of a pixel, in
@@ -53,7 +53,7 @@ class SeamMap:
         """Images that own anything on a box (canvas pixels), ascending; -1 first where a part has no owner."""
         return [int(owner) for owner in np.unique(self._window(box))]
 
-    def share(self, owner: int, box: Box) -> Float32Array:
+    def weights(self, owner: int, box: Box) -> Float32Array:
         """How much of each pixel of a box (canvas pixels) an image owns: labels interpolated linearly, (h, w).
 
         Every value depends on the labels around it alone, bit for bit, whatever the box: sums of ones and of shares of
@@ -66,10 +66,10 @@ class SeamMap:
         if side > 1:
             owned = cv2.boxFilter(owned, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
         size = (owned.shape[1] * self.factor, owned.shape[0] * self.factor)
-        share = np.asarray(cv2.resize(owned, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+        weights = np.asarray(cv2.resize(owned, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
         x, y = (edge % self.factor + (1 + self.softness) * self.factor for edge in box[:2])
-        share = share[y : y + box[3] - box[1], x : x + box[2] - box[0]]
-        return share * np.float32(1.0 / side**2)
+        weights = weights[y : y + box[3] - box[1], x : x + box[2] - box[0]]
+        return weights * np.float32(1.0 / side**2)
 
     def repeated(self, period: int) -> "SeamMap":
         """The map of a canvas that goes all the way round, wider than a full turn of ``period`` canvas pixels.
@@ -150,7 +150,7 @@ def _cut(
     pixels: NDArray[Any],
     below: NDArray[Any],
     covered: NDArray[np.bool_],
-    share: Float32Array,
+    weight_fraction: Float32Array,
     *,
     in_pieces: bool,
 ) -> NDArray[np.bool_]:
@@ -160,8 +160,8 @@ def _cut(
     """
     both = inside & covered
     alone: NDArray[np.bool_] = inside & ~covered
-    free = both & (share > _MIN_SHARE) & (share < _MAX_SHARE)
-    surely_new: NDArray[np.bool_] = alone | (both & (share >= _MAX_SHARE))
+    free = both & (weight_fraction > _MIN_WEIGHT) & (weight_fraction < _MAX_WEIGHT)
+    surely_new: NDArray[np.bool_] = alone | (both & (weight_fraction >= _MAX_WEIGHT))
     surely_old = covered & ~(surely_new | free)
     if not free.any():
         return surely_new
@@ -172,7 +172,7 @@ def _cut(
     won = surely_new.copy()
     for part in _parts(free) if in_pieces else [_around(free)]:
         masks = [(free | sure)[part].astype(np.uint8) * np.uint8(255) for sure in (surely_old, surely_new)]
-        won[part] |= free[part] & _graph_cut(_visibility(pixels[part], below[part], share[part]), masks)
+        won[part] |= free[part] & _graph_cut(_visibility(pixels[part], below[part], weight_fraction[part]), masks)
     return won
 
 
@@ -196,7 +196,7 @@ def _around(free: NDArray[np.bool_]) -> tuple[slice, slice]:
     )
 
 
-def _visibility(first: NDArray[Any], second: NDArray[Any], share: Float32Array) -> Float32Array:
+def _visibility(first: NDArray[Any], second: NDArray[Any], weight_fraction: Float32Array) -> Float32Array:
     """How much a seam shows at each pixel (h, w): the square of what two images differ by in brightness and in edges.
 
     One broken edge shows more than many small differences. ``share`` of both border weights says how far it is from the
@@ -207,7 +207,7 @@ def _visibility(first: NDArray[Any], second: NDArray[Any], share: Float32Array) 
     mean = np.full(first.shape[2], 1.0 / (first.shape[2] * full_scale(first.dtype)), dtype=np.float32)
     grey = difference @ mean
     edges = sum(np.abs(cv2.Sobel(grey, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=_EDGES / 8)) for dx in (1, 0))
-    shown, aside = np.abs(difference) @ mean + edges, _ASIDE * (2.0 * share - 1.0)
+    shown, aside = np.abs(difference) @ mean + edges, _ASIDE * (2.0 * weight_fraction - 1.0)
     return np.asarray(_VISIBLE**2 * np.minimum(shown**2 + aside**2, 1.0), dtype=np.float32)
 
 

@@ -36,8 +36,8 @@ class _Image:
         """Ends (N, 2, 2) of the long lines on the canvas."""
         levels = self.grey.astype(np.float32)
         levels = (levels - levels.min()) * np.float32(255.0 / self._full)
-        found: Any = cv2.createLineSegmentDetector().detect(np.clip(levels, 0, 255).astype(np.uint8))[0]
-        ends = np.reshape(np.empty(0) if found is None else found, (-1, 2, 2)).astype(np.float64)
+        segments: Any = cv2.createLineSegmentDetector().detect(np.clip(levels, 0, 255).astype(np.uint8))[0]
+        ends = np.reshape(np.empty(0) if segments is None else segments, (-1, 2, 2)).astype(np.float64)
         long = np.hypot(*(ends[:, 1] - ends[:, 0]).T) >= self._min_length
         return np.asarray(ends[long] + self.box[:2])
 

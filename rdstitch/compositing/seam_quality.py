@@ -36,7 +36,7 @@ _CHANCE, _MIN_ALIKE = 0.2, 0.5
 _DIRECTED = 0.4
 _MIN_LINE = 2 * _HALF  # pixels of a line that a person follows: longer than the window that it crosses
 _NEXT = 2.2 * _STEP  # pixels up to which places of a border follow each other
-_MAX_SHARE, _MIN_BROKEN = 0.03, 3  # of the places that may be broken before a person sees it
+_MAX_BROKEN, _MIN_BROKEN = 0.03, 3  # of the places that may be broken before a person sees it
 _MAX_LENGTH = 0.045  # of a break that a person does not see, diagonals of an image
 _SURELY_ALIKE = 0.9  # correlation of windows that need not be moved
 
@@ -86,7 +86,7 @@ class SeamQuality:
         return self.alike < _CHANCE
 
     @property
-    def share(self) -> float:
+    def broken_fraction(self) -> float:
         """Share of the places that is broken, [0, 1]."""
         return float(self.broken.mean()) if len(self.broken) else 0.0
 
@@ -108,7 +108,7 @@ class SeamQuality:
 
     def _many(self, counted: BoolArray, stretches: tuple[SeamBreak, ...]) -> bool:
         longest = stretches[0].length if stretches else 0.0
-        many = counted.sum() >= _MIN_BROKEN and counted.mean() > _MAX_SHARE
+        many = counted.sum() >= _MIN_BROKEN and counted.mean() > _MAX_BROKEN
         return bool(many) or longest > _MAX_LENGTH * DIAGONAL / _STEP * self.spacing
 
     def cropped(self, box: Box) -> "SeamQuality":
@@ -144,7 +144,7 @@ def measure_seams(
     pairs, at = _border_places(labels, label_size)
     searchable: dict[int, dict[int, BoolArray]] = {}  # by image
     lines = SeamLines(labels, label_size, _HALF)
-    found: list[tuple[IntArray, FloatArray, _Verdict]] = []
+    measured: list[tuple[IntArray, FloatArray, _Verdict]] = []
     ordered, start = np.unique(pairs, axis=0, return_index=True)
     for pair, along in zip(ordered, np.split(at, start[1:]), strict=False):
         first, second = (tiles[k] for k in pair)
@@ -158,11 +158,13 @@ def measure_seams(
         here, reaches = _comparable_places((first, areas1), (second, areas2), along)
         near_border = _on_border(labels, label_size, pair)
         verdicts = _verdicts(first, second, np.rint(here).astype(np.intp), reaches, near_border, CONTRAST * full)
-        found += [(pair, place, verdict) for place, verdict in zip(here, verdicts, strict=True) if verdict is not None]
-    if not found:
+        measured += [
+            (pair, place, verdict) for place, verdict in zip(here, verdicts, strict=True) if verdict is not None
+        ]
+    if not measured:
         return SeamQuality(spacing=_STEP * unit)
-    images, places = np.array([pair for pair, _, _ in found]), np.array([place for _, place, _ in found])
-    misfit, shift = (np.array(values) for values in zip(*(verdict for _, _, verdict in found), strict=True))
+    images, places = np.array([pair for pair, _, _ in measured]), np.array([place for _, place, _ in measured])
+    misfit, shift = (np.array(values) for values in zip(*(verdict for _, _, verdict in measured), strict=True))
     runs, broken = _runs(images, places, misfit), np.zeros_like(misfit)
     for run in runs:
         ends = np.array([lines.end(images[k], places[k]) for k in run])
@@ -177,13 +179,13 @@ def measure_seams(
 
 def _border_places(labels: NDArray[np.int32], label_size: float) -> tuple[IntArray, FloatArray]:
     """Pairs of owners (N, 2), ascending, and places of their borders (N, 2) on the canvas of the tiles."""
-    found = []
+    borders = []
     for first, second, right, down in ((labels[:, :-1], labels[:, 1:], 0.5, 0.0), (labels[:-1], labels[1:], 0.0, 0.5)):
         y, x = np.nonzero((first != second) & (first >= 0) & (second >= 0))
         owners = np.sort(np.column_stack([first[y, x], second[y, x]]), axis=1)
         at = (np.column_stack([x + right, y + down]) + 0.5) * label_size - 0.5
-        found.append(np.column_stack([owners, at]))
-    every = np.concatenate(found)
+        borders.append(np.column_stack([owners, at]))
+    every = np.concatenate(borders)
     keys = np.column_stack([every[:, :2], np.floor(every[:, 2:] / _STEP)]).astype(np.int64)
     order = np.lexsort((every[:, 3], every[:, 2], *keys.T[::-1]))
     every, keys = every[order], keys[order]
@@ -311,7 +313,7 @@ def correlation(windows1: FloatArray | Float32Array, windows2: FloatArray | Floa
 
 def _best_shift(first: SeamTile, second: SeamTile, at: IntArray, reach: int) -> tuple[float, float]:
     """Highest correlation of windows at any shift, and its length; NaN where the way back is another."""
-    found = []
+    peaks = []
     for one, other in ((first, second), (second, first)):
         x, y = at - one.box[:2]
         u, v = at - other.box[:2]
@@ -319,9 +321,9 @@ def _best_shift(first: SeamTile, second: SeamTile, at: IntArray, reach: int) -> 
         window = one.grey[y - _HALF : y + _HALF + 1, x - _HALF : x + _HALF + 1]
         scores = cv2.matchTemplate(np.ascontiguousarray(wide), np.ascontiguousarray(window), cv2.TM_CCOEFF_NORMED)
         _, best, _, place = cv2.minMaxLoc(scores)
-        found.append((best, np.array(place) - reach))
-    (best, there), (_, back) = found
-    return best, float(np.hypot(*there)) if np.hypot(*(there + back)) <= 2 else math.nan
+        peaks.append((best, np.array(place) - reach))
+    (best, forward), (_, backward) = peaks
+    return best, float(np.hypot(*forward)) if np.hypot(*(forward + backward)) <= 2 else math.nan
 
 
 def _edges(window: Float32Array) -> tuple[float, float]:

@@ -41,8 +41,8 @@ def static_pixels(images: Sequence[NDArray[np.generic]]) -> BoolArray | None:
     closed = cv2.morphologyEx((_agreement(grey, window) > _STAYS).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
     static = _border(grey <= low + same, window) | _regions(cv2.morphologyEx(closed, cv2.MORPH_OPEN, kernel) > 0)
     static = _with_captions(static, np.ptp(grey, axis=0) <= same, window)
-    share = float(static.mean())
-    return static if _MIN_AREA < share < _MAX_AREA else None
+    fraction = float(static.mean())
+    return static if _MIN_AREA < fraction < _MAX_AREA else None
 
 
 def _agreement(grey: Float32Array, window: int) -> Float32Array:
@@ -94,12 +94,14 @@ def _border(dark: NDArray[np.bool_], window: int) -> BoolArray:
 
     What is dark in all by chance (the ground of a microscope, a shadow) ends where the first of them is not.
     """
-    found = _regions(np.asarray(dark.all(axis=0)))
-    _, labels = cv2.connectedComponents(found.astype(np.uint8))
-    border = np.zeros_like(found)
+    dark_regions = _regions(np.asarray(dark.all(axis=0)))
+    _, labels = cv2.connectedComponents(dark_regions.astype(np.uint8))
+    border = np.zeros_like(dark_regions)
     for label in set(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]).tolist()) - {0}:
         region = labels == label
-        beyond = cv2.dilate(region.astype(np.uint8), np.ones((window, window), np.uint8)).astype(np.bool_) & ~found
+        beyond = (
+            cv2.dilate(region.astype(np.uint8), np.ones((window, window), np.uint8)).astype(np.bool_) & ~dark_regions
+        )
         if beyond.any() and dark[:, beyond].mean() < 0.5:
             border |= region
     return border

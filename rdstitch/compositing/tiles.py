@@ -21,7 +21,7 @@ from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.render import Renderer
 from rdstitch.io.strips import STRIP_ROWS
 from rdstitch.system.cache import Cache, Stored
-from rdstitch.system.progress import ShareProgress, unheard
+from rdstitch.system.progress import FractionProgress, no_progress
 
 OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]
 """Samples (h, W, C) and alpha (h, W)."""
@@ -61,7 +61,7 @@ class TiledOutput:
         renderer, images = self.renderer.part(box, self.workers)
         return TiledOutput(renderer, box, self.tile_size, 1), images
 
-    def strips(self, progress: ShareProgress = unheard) -> Generator[OutputStrip]:
+    def strips(self, progress: FractionProgress = no_progress) -> Generator[OutputStrip]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
         if self.workers == 1:
             yield from self._strips(map, progress)
@@ -69,7 +69,7 @@ class TiledOutput:
         with ThreadPoolExecutor(self.workers) as pool:
             yield from self._strips(pool.map, progress)
 
-    def _strips(self, run: Callable[..., Iterator[Any]], progress: ShareProgress) -> Iterator[OutputStrip]:
+    def _strips(self, run: Callable[..., Iterator[Any]], progress: FractionProgress) -> Iterator[OutputStrip]:
         """The same, with tiles computed by ``run``, which works like ``map`` and may work ahead."""
         (width, height), side = self.size, self.tile_size
         tops = iter(range(0, height, side))
@@ -127,12 +127,12 @@ BlockRunner = Callable[[Iterable[Block]], Generator[list[Stored[OutputStrip]]]]
 """Computes blocks elsewhere: their strips, in the order of the blocks, which are taken as they are needed."""
 
 
-def strips_of(whole: TiledOutput, elsewhere: BlockRunner | None, progress: ShareProgress) -> Generator[OutputStrip]:
+def strips_of(whole: TiledOutput, elsewhere: BlockRunner | None, progress: FractionProgress) -> Generator[OutputStrip]:
     """The strips of an output, which is computed here or in blocks elsewhere; the same, bit for bit."""
     return whole.strips(progress) if elsewhere is None else _strips_of_blocks(whole, elsewhere, progress)
 
 
-def _strips_of_blocks(whole: TiledOutput, run: BlockRunner, progress: ShareProgress) -> Generator[OutputStrip]:
+def _strips_of_blocks(whole: TiledOutput, run: BlockRunner, progress: FractionProgress) -> Generator[OutputStrip]:
     (x0, y0, x1, y1), (width, height) = whole.box, _block_size(whole)
     lefts = range(x0, x1, width)
 

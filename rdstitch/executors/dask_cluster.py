@@ -79,16 +79,16 @@ class DaskExecutor(Executor):
     def _check_workers(self, store: Path | None) -> None:
         """Refuse workers whose results would be others, or that could not hand them over."""
         try:
-            found: dict[str, tuple[bool, dict[str, str]]] = self._client.run(_describe_worker, store)
+            of_workers: dict[str, tuple[bool, dict[str, str]]] = self._client.run(_describe_worker, store)
         except ImportError as error:
             raise ArgumentError(f"a worker of the cluster has no rdstitch: {error}") from error
-        for worker, (sees_store, versions) in sorted(found.items()):
+        for worker, (sees_store, versions) in sorted(of_workers.items()):
             if not sees_store:
                 raise ArgumentError(
                     f"{store}: the worker {worker} does not see this folder; give --cache a folder that all "
                     "machines share by the same name"
                 )
-            others = sorted(name for name, own in software().items() if versions.get(name) != own)
+            others = sorted(name for name, version in software().items() if versions.get(name) != version)
             if others:
                 raise ArgumentError(
                     f"the worker {worker} has another version of {', '.join(others)} than this machine; install the "

@@ -27,7 +27,7 @@ _SAME_LIGHT = 0.05  # change of brightness and contrast up to which they count a
 _STILL, _MOVED = 0.5, 3.0  # pixels: what stays in the image, such as a robot's body, and what moves with the ground
 _SEEN_TO_MOVE = 15  # corners that move, where those that do not are none of the ground
 _PLACES, _SURE = 32, 3  # a side, that are told apart, and still corners more than moving ones that make one static
-_MIN_SHARE = 0.3  # of the corners, below which they no longer stand for the keyframe
+_MIN_TRACKED = 0.3  # of the corners, below which they no longer stand for the keyframe
 
 
 class CornerFlow:
@@ -50,11 +50,11 @@ class CornerFlow:
         None where too few of them can be followed.
         """
         last = self._last
-        if last is None or last.grey.shape != frame.grey.shape or len(self._at) < max(1.0, _MIN_SHARE * self.count):
+        if last is None or last.grey.shape != frame.grey.shape or len(self._at) < max(1.0, _MIN_TRACKED * self.count):
             return None
         at, kept = _moved(last.grey, frame, self._at, _LEVELS)
         self._last, self._from, self._at = frame, self._from[kept], at[kept]
-        if len(self._at) < _MIN_SHARE * self.count:
+        if len(self._at) < _MIN_TRACKED * self.count:
             return None
         moved = np.linalg.norm(self._at - self._from, axis=1)
         ground = ~self.is_static(self._at)
@@ -84,13 +84,13 @@ def corners_of(frame: PreparedImage) -> FloatArray:
         np.linspace(0, side, count + 1).astype(int) for side, count in zip((width, height), _TILES, strict=True)
     )
     most, spacing = _CORNERS // (_TILES[0] * _TILES[1]), _SPACING * max(frame.grey.shape)
-    found: list[FloatArray] = [np.empty((0, 2))]
+    tiles: list[FloatArray] = [np.empty((0, 2))]
     for top, bottom in pairwise(down.tolist()):
         for left, right in pairwise(across.tolist()):
             corners = cv2.goodFeaturesToTrack(frame.grey[top:bottom, left:right], most, _QUALITY, spacing)
             if corners is not None:
-                found.append(corners[:, 0].astype(np.float64) + np.array([left, top]))
-    spread = np.concatenate(found)
+                tiles.append(corners[:, 0].astype(np.float64) + np.array([left, top]))
+    spread = np.concatenate(tiles)
     return spread[_usable(frame, spread)]
 
 

@@ -30,9 +30,9 @@ def overlapping(features1: Features, features2: Features, matches: Correspondenc
     if len(matches) < _MIN_MATCHES or size1 is None or size2 is None:
         return None
     points1, points2 = matches.points1[:_MAX_MATCHES], matches.points2[:_MAX_MATCHES]
-    apart = np.maximum(_squared_distances(points1, size1), _squared_distances(points2, size2))
+    distances = np.maximum(_squared_distances(points1, size1), _squared_distances(points2, size2))
     # Each is the first in its own company.
-    company = np.sqrt(np.partition(apart, _SUPPORTING_NEIGHBOURS, axis=1)[:, _SUPPORTING_NEIGHBOURS])
+    company = np.sqrt(np.partition(distances, _SUPPORTING_NEIGHBOURS, axis=1)[:, _SUPPORTING_NEIGHBOURS])
     right = company <= _NEIGHBOURHOOD
     if np.count_nonzero(~right) > _STRAY:
         return None

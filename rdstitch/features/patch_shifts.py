@@ -52,9 +52,9 @@ def patch_shifts(first: Edges, second: Edges, expected: Callable[[FloatArray], F
     points = corners.astype(np.float64).reshape(-1, 2) + (side - 1) / 2
     starts = np.rint(expected(points) - points)
     starts = np.where(np.isfinite(starts), starts, 0.0).astype(np.intp) + corners.reshape(-1, 2)
-    found = []
+    matches = []
     for (x, y), (u, v), point in zip(corners.reshape(-1, 2).tolist(), starts.tolist(), points, strict=True):
         if 0 <= u <= width - side and 0 <= v <= height - side:
             moved = _shift(first[y : y + side, x : x + side], second[v : v + side, u : u + side])
-            found.append((point, point + moved + np.array([u - x, v - y])))
-    return np.array(found).reshape(-1, 2, 2).swapaxes(0, 1)
+            matches.append((point, point + moved + np.array([u - x, v - y])))
+    return np.array(matches).reshape(-1, 2, 2).swapaxes(0, 1)

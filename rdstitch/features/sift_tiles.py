@@ -53,10 +53,10 @@ def _in_whole(part: Detection, corner: NDArray[np.intp], factor: FloatArray) -> 
     """
     enlargement = float(np.sqrt(factor.prod()))
 
-    def moved(found: _Keypoints) -> _Keypoints:
-        points = (found.points + corner + 0.5) * factor - 0.5
-        scale, response = found.scale * enlargement, found.response * enlargement
-        return replace(found, points=points, scale=scale, response=response)
+    def moved(keypoints: _Keypoints) -> _Keypoints:
+        points = (keypoints.points + corner + 0.5) * factor - 0.5
+        scale, response = keypoints.scale * enlargement, keypoints.response * enlargement
+        return replace(keypoints, points=points, scale=scale, response=response)
 
     return moved(replace(part, describe=lambda chosen: moved(part.describe(chosen))))
 

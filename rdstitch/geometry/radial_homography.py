@@ -111,12 +111,10 @@ class TransferJacobian:
     by_image: FloatArray  # (2, 3, N): by ``z = H p``
     lifted: FloatArray  # (3, N): ``p``
     by_point: FloatArray  # (N, 2, 2): by the point in image 1
-    # by_divisor, by_own_divisor: (N, 2): by ``g`` of the lens at the point in image 1, and by that at the point in
-    # image 2
-    by_divisor: FloatArray
-    by_own_divisor: FloatArray
-    radius2: FloatArray  # radius2, own_radius2: (N,): squared radii of those
-    own_radius2: FloatArray
+    by_divisor1: FloatArray  # (N, 2): by ``g`` of the lens at the point in image 1
+    by_divisor2: FloatArray  # (N, 2): by ``g`` at the point in image 2
+    squared_radius1: FloatArray  # (N,)
+    squared_radius2: FloatArray  # (N,)
 
     @property
     def by_homography(self) -> FloatArray:
@@ -130,7 +128,7 @@ class TransferJacobian:
         The centre shifts in both images.
         """
         columns = [
-            self.by_divisor.T * self.radius2**power + self.by_own_divisor.T * self.own_radius2**power
+            self.by_divisor1.T * self.squared_radius1**power + self.by_divisor2.T * self.squared_radius2**power
             for power in (1, 2, 3)
             if free[power - 1]
         ]

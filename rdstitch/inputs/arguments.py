@@ -117,13 +117,13 @@ def _at_url(url: str) -> Expanded:
     if address.suffix.lower() in VIDEO_SUFFIXES:
         raise InputError(f"{path}: only images are read from other machines; download the video first")
     try:
-        found = sorted(map(Path, remote_names(url)), key=natural_key)
+        names = sorted(map(Path, remote_names(url)), key=natural_key)
     except OSError as error:
         raise InputError(f"{path}: {error}") from error
-    found = [name for name in found if name.suffix.lower() in READABLE_SUFFIXES | HEIF_SUFFIXES]
-    if not found:
+    names = [name for name in names if name.suffix.lower() in READABLE_SUFFIXES | HEIF_SUFFIXES]
+    if not names:
         raise InputError(f"{path}: there are no images at this address")
-    return Expanded.several(found)
+    return Expanded.several(names)
 
 
 def _exists(path: Path) -> bool:
@@ -178,7 +178,7 @@ def _matching(pattern: str) -> list[Path]:
     if len(pattern) > _MAX_PATTERN:
         raise InputError(f"{pattern[:40]}…: a pattern of {len(pattern)} characters is too long")
     matching = map(Path, glob.glob(pattern))  # noqa: PTH207 - a pattern may be absolute
-    found = [path for path in matching if path.is_file()]
-    if not found:
+    files = [path for path in matching if path.is_file()]
+    if not files:
         raise InputError(f"{pattern}: no file matches this pattern")
-    return sorted(found, key=natural_key)
+    return sorted(files, key=natural_key)

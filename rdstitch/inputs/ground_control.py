@@ -66,11 +66,11 @@ def with_ground_control(
         raise InputError(f"{file}: has no ground control point in any of the images")
     places = [GpsPosition(*degrees) for degrees in geographic_places([mark.place for mark in marks], str(file), system)]
     metres = metres_around_median(places).tolist()
-    found = contradicting_places([mark.point for mark in marks], metres, [mark.std for mark in marks])
-    if found is not None:
-        first, second = (marks[k] for k in found[:2])
+    contradiction = contradicting_places([mark.point for mark in marks], metres, [mark.std for mark in marks])
+    if contradiction is not None:
+        first, second, distance = marks[contradiction[0]], marks[contradiction[1]], contradiction[2]
         raise InputError(
-            f"{second.place.where}: {second.point} is {found[2]:.3g} m from where it is by {first.place.where}; "
+            f"{second.place.where}: {second.point} is {distance:.3g} m from where it is by {first.place.where}; "
             "give it one place, or other points another name"
         )
     epsg = None if system is None else system.epsg
@@ -118,19 +118,19 @@ def _is_listed(line: str) -> bool:
 
 def _opendronemap(text: str, file: str) -> list[Row]:
     """The lines of a ``gcp_list.txt`` below its coordinate system; what follows the numbers is an image and a point."""
-    found = []
+    rows = []
     for where, line in numbered_lines(text, file):
         fields = line.split(maxsplit=5)
         if len(fields) < 6:
             raise InputError(f"{where}: expected X Y Z PX PY IMAGE [NAME], or a heading like {_CONTROL_WANTED[0]}")
-        found.append((where, zip(_CONTROL_LISTED, fields, strict=True)))
-    return rows_of(found)
+        rows.append((where, zip(_CONTROL_LISTED, fields, strict=True)))
+    return rows_of(rows)
 
 
 def _images_and_point(row: Row, names: ImagesByName) -> tuple[list[int], str]:
     """Indices of the image that a row names, which may have spaces, and the point's name, which may follow it."""
     text = row.values.get("name") or row.image
-    for end in sorted((found.start() for found in re.finditer(r"\s+|$", text)), reverse=True):
+    for end in sorted((space.start() for space in re.finditer(r"\s+|$", text)), reverse=True):
         if images := names.find(text[:end], row.where)[0]:
             return images, text[end:].strip() or row.values.get("point", "")
     return [], ""

@@ -48,7 +48,7 @@ def is_rdstitch_output(path: Path) -> bool:
     """Whether rdstitch wrote this image: the sidecar beside it says so, and means this one."""
     try:
         record = json.loads(read_limited(path.with_name(path.name + ".json"), MAX_FILE))
-        own = record["format"] == "rdstitch sidecar"
-        return own and canonical_text(str(record["output"]["file"])) == canonical_name(path.name)
+        is_sidecar = record["format"] == "rdstitch sidecar"
+        return is_sidecar and canonical_text(str(record["output"]["file"])) == canonical_name(path.name)
     except (OSError, ValueError, TypeError, LookupError, RecursionError):
         return False

@@ -130,12 +130,12 @@ def _places(sources: Sequence[Source], file: str | Path, epsg: int | None, offse
 
 def _listed(text: str, file: str) -> list[Row]:
     """The lines of a ``geo.txt`` below its coordinate system."""
-    found = []
+    rows = []
     for where, line in numbered_lines(text, file):
         if not (fields := _listed_fields(line)):
             raise InputError(f"{where}: expected a name and numbers between blanks, not '{line}'")
-        found.append((where, zip(_LISTED, fields, strict=False)))
-    return rows_of(found)
+        rows.append((where, zip(_LISTED, fields, strict=False)))
+    return rows_of(rows)
 
 
 def _listed_fields(line: str) -> list[str]:
@@ -153,9 +153,9 @@ def _listed_fields(line: str) -> list[str]:
 def _by_rows(rows: Sequence[Row | None], file: str, system: NamedSystem | None) -> list[GpsPosition | None]:
     """The positions that rows tell."""
     places: list[GpsPosition | None] = []
-    found = [None if row is None else coordinates_of(row) for row in rows]
-    degrees = iter(geographic_places([each for each in found if each is not None], file, system))
-    for row, each in zip(rows, found, strict=True):
+    coordinates = [None if row is None else coordinates_of(row) for row in rows]
+    degrees = iter(geographic_places([each for each in coordinates if each is not None], file, system))
+    for row, each in zip(rows, coordinates, strict=True):
         if row is None or each is None:
             places.append(None)
             continue
@@ -193,11 +193,15 @@ def accuracy_of(row: Row) -> tuple[float, float] | None:
     return math.hypot(along, across) / math.sqrt(2.0), up if up and up > 0.0 else 2.0 * max(along, across)
 
 
-def geographic_places(found: Sequence[Coordinates], file: str, system: NamedSystem | None) -> list[tuple[float, float]]:
+def geographic_places(
+    coordinates: Sequence[Coordinates], file: str, system: NamedSystem | None
+) -> list[tuple[float, float]]:
     """Latitude and longitude of each: those that it has, else by the system of x and y."""
-    degrees = np.array([(one.y, one.x) for one in found]).reshape(-1, 2)
-    projected = np.array([not one.geographic and (system is None or system.epsg != WGS84) for one in found], dtype=bool)
-    for one, on_map in zip(found, projected.tolist(), strict=True):
+    degrees = np.array([(one.y, one.x) for one in coordinates]).reshape(-1, 2)
+    projected = np.array(
+        [not one.geographic and (system is None or system.epsg != WGS84) for one in coordinates], dtype=bool
+    )
+    for one, on_map in zip(coordinates, projected.tolist(), strict=True):
         if on_map and system is None:
             raise InputError(f"{one.where}: in which coordinate system x and y are is not known; give --crs")
         if not on_map and not (abs(one.y) <= 90.0 and abs(one.x) <= 180.0):

@@ -115,9 +115,9 @@ def camera_in(path: str | Path) -> Camera:
 
     if not is_bag(Path(path)):
         return load_camera(path)
-    if (found := camera_in_bag(Path(path))) is None:
+    if (calibrated := camera_in_bag(Path(path))) is None:
         raise InputError(f"{path}: the bag has no calibration in a topic of camera_info")
-    return found[0].camera
+    return calibrated[0].camera
 
 
 def chosen_topic(path: Path, reader: Any, wanted: str | None) -> str:

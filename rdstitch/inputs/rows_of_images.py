@@ -57,16 +57,16 @@ class ImagesByName:
 
     def find(self, name: str, where: str) -> tuple[list[int], _Same]:
         """Indices of the image of this name, none where there is none, and how much they have in common."""
-        written, best, found = name_parts(name), _Same(1, 0), list[list[int]]()
+        written, best, same_names = name_parts(name), _Same(1, 0), list[list[int]]()
         for place, indices in self._alike.get(written[-1].casefold(), {}).items() if written else ():
             same, called = _Same.of(place, written), self._images[indices[0]].name.split("/")
             if same >= best and same.folded >= min(len(called), len(written)):
-                found = [*found, indices] if same == best else [indices]
+                same_names = [*same_names, indices] if same == best else [indices]
                 best = same
-        if len(found) > 1:
-            names = shortened([self._images[indices[0]].name for indices in found])
+        if len(same_names) > 1:
+            names = shortened([self._images[indices[0]].name for indices in same_names])
             raise InputError(f"{where}: {written[-1]} could be any of {names}; write it with its folder")
-        return (found[0] if found else []), best
+        return (same_names[0] if same_names else []), best
 
 
 class RowsByImage:

@@ -181,11 +181,11 @@ def numbers_before(fields: Sequence[str]) -> list[str]:
 
 
 def rows_of(
-    found: Iterable[tuple[str, Iterable[tuple[str, Any]]]], column_of: Callable[[str], str | None] = str
+    cells_of_rows: Iterable[tuple[str, Iterable[tuple[str, Any]]]], column_of: Callable[[str], str | None] = str
 ) -> list[Row]:
     """Rows of cells with their headings, with the decimal mark that their unambiguous numbers share."""
     rows = []
-    for where, cells in found:
+    for where, cells in cells_of_rows:
         values: dict[str, str] = {}
         for heading, cell in cells:
             column, text = column_of(heading), "" if cell is None else str(cell).strip()

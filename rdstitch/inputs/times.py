@@ -24,8 +24,8 @@ def timestamps_of(sources: Sequence[Source]) -> FloatArray:
     That of a table, see :func:`with_times`, or of the video (from its beginning) or bag, else that of EXIF (since 1970,
     in UTC where EXIF has no time zone).
     """
-    own = [(None if source.frame is None else source.frame.timestamp) for source in sources]
-    times = [s.metadata.timestamp if known is None else known for s, known in zip(sources, own, strict=True)]
+    of_frames = [(None if source.frame is None else source.frame.timestamp) for source in sources]
+    times = [s.metadata.timestamp if known is None else known for s, known in zip(sources, of_frames, strict=True)]
     return np.array([math.nan if time is None else time for time in times])
 
 

@@ -41,8 +41,8 @@ def read_ome(text: str | None) -> OmeImage | None:
         return None
     counts = [int(images[0].get(f"Size{axis}", 1)) for axis in _COUNTED]
     samples = [int(channel.get("SamplesPerPixel", 1)) for channel in images[0].iter("Channel")]
-    apart = len(images) == 1 and counts[1:] == [1, 1] and all(count == 1 for count in samples)
-    return OmeImage(counts[0] if apart else 1, ome_pixel_size(images[0]))
+    separate = len(images) == 1 and counts[1:] == [1, 1] and all(count == 1 for count in samples)
+    return OmeImage(counts[0] if separate else 1, ome_pixel_size(images[0]))
 
 
 def ome_tree(text: str | None) -> ElementTree.Element | None:
@@ -60,7 +60,7 @@ def ome_pixel_size(pixels: ElementTree.Element) -> float | None:
 
 
 def ome_planes(
-    file: Path, pages: int, pixels: ElementTree.Element, own: str | None
+    file: Path, pages: int, pixels: ElementTree.Element, uuid: str | None
 ) -> dict[tuple[int, int, int], Page]:
     """Where the planes of an image are, of ``file`` no more than it has pages.
 
@@ -77,7 +77,7 @@ def ome_planes(
         holder = file
         if identity is not None:
             name = identity.get("FileName")
-            mine = (identity.text or "").strip() == own if own is not None else name == file.name
+            mine = (identity.text or "").strip() == uuid if uuid is not None else name == file.name
             holder = file if mine or name is None else file.parent / name
         first = np.ravel_multi_index(
             [int(data.get(f"First{axis}", 0)) for axis in reversed(order)], [counts[axis] for axis in reversed(order)]

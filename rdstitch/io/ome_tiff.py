@@ -24,7 +24,7 @@ def write_ome_tiff(path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_t
     Channels become pages; those of a colour image stay together.
     """
     sizes = pyramid_sizes(spec.size, MIN_OVERVIEW)
-    apart = spec.metadata.planes or spec.channels != 3
+    separate = spec.metadata.planes or spec.channels != 3
     passing_levels = pyramid(sizes, zero_uncovered(strips), path.parent, transparent=False)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         levels: list[NDArray[Any]] = []
@@ -37,35 +37,35 @@ def write_ome_tiff(path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_t
         with tifffile.TiffWriter(path, ome=True, bigtiff=total > 2**31) as tiff:
             for number, pixels in enumerate(levels):
                 height, width, channels = pixels.shape
-                parts = [pixels[..., k : k + 1] for k in range(channels)] if apart else [pixels]
+                parts = [pixels[..., k : k + 1] for k in range(channels)] if separate else [pixels]
                 tops = range(0, height, STRIP_ROWS)
                 shown = (np.ascontiguousarray(part[top : top + STRIP_ROWS]) for part in parts for top in tops)
                 tiff.write(
                     (encoded_tile(tile) for tile in tiles_of(shown)),
-                    shape=(channels, height, width) if apart else (height, width, channels),
+                    shape=(channels, height, width) if separate else (height, width, channels),
                     dtype=spec.dtype,
-                    photometric="minisblack" if apart else "rgb",
-                    planarconfig=None if apart else "contig",
+                    photometric="minisblack" if separate else "rgb",
+                    planarconfig=None if separate else "contig",
                     tile=(TILE, TILE),
                     compression="zlib",
                     predictor=has_predictor(spec.dtype),
                     subifds=None if number else len(levels) - 1,
                     subfiletype=1 if number else 0,
-                    metadata=None if number else _ome_metadata(spec, pixels, apart=apart),
+                    metadata=None if number else _ome_metadata(spec, pixels, separate=separate),
                     software="rdstitch",
                     iccprofile=None if number else spec.metadata.icc_profile or None,
                     extratags=[] if number else [*copied_tags(spec.metadata), *extra_tags],
                 )
 
 
-def _ome_metadata(spec: ImageSpec, pixels: NDArray[Any], *, apart: bool) -> dict[str, Any]:
-    """What OME-XML says of the image, whose channels are pages where they are ``apart``."""
+def _ome_metadata(spec: ImageSpec, pixels: NDArray[Any], *, separate: bool) -> dict[str, Any]:
+    """What OME-XML says of the image, whose channels are pages where they are ``separate``."""
     samples = hashlib.sha256(pixels.data).hexdigest()
     identity = uuid.uuid5(uuid.NAMESPACE_OID, f"rdstitch {spec.size} {spec.channels} {spec.dtype} {samples}")
-    content: dict[str, Any] = {"axes": "CYX" if apart else "YXS", "UUID": f"urn:uuid:{identity}"}
+    content: dict[str, Any] = {"axes": "CYX" if separate else "YXS", "UUID": f"urn:uuid:{identity}"}
     if spec.metadata.pixel_size is not None:
         for axis in "XY":
             content |= {f"PhysicalSize{axis}": spec.metadata.pixel_size, f"PhysicalSize{axis}Unit": "µm"}
-    if apart and len(spec.metadata.channel_names) == spec.channels:
+    if separate and len(spec.metadata.channel_names) == spec.channels:
         content["Channel"] = {"Name": list(spec.metadata.channel_names)}
     return content

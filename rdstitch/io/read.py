@@ -79,7 +79,7 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
                     # Pillow would cut 16-bit colour to 8.
                     samples, alpha = _split(imagecodecs.png_decode(read_beginning(file, _most_bytes(opened.size))))
                 else:
-                    factor, decoded = _decoders_share(opened, metadata, reduction), None
+                    factor, decoded = _decoder_reduction(opened, metadata, reduction), None
                     if opened.format in _JPEG and opened.mode in ("L", "RGB"):
                         decoded, damage = decoded_jpeg(file, opened.size, factor, grey=opened.mode == "L")
                     samples, alpha = from_pillow(opened, factor) if decoded is None else (decoded, None)
@@ -129,7 +129,7 @@ def _is_padding(complaint: str, data: bytes) -> bool:
     return padding is not None and not data[max(0, end - int(padding[1])) : end].strip(b"\0\xff")
 
 
-def _decoders_share(image: Image.Image, metadata: Metadata, reduction: int) -> int:
+def _decoder_reduction(image: Image.Image, metadata: Metadata, reduction: int) -> int:
     """By how much of a reduction the decoder can make the image smaller; 1 for nothing."""
     factor = math.gcd(reduction, _MAX_DECODED_REDUCTION)
     # Blocks begin at the stored image's first pixel; in one that is to be mirrored they must end at its last.

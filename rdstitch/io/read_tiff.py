@@ -132,8 +132,8 @@ def _straight(colours: Pixels, alpha: Pixels, full: float) -> Pixels:
     straight = np.empty_like(colours)
     for top in range(0, len(colours), ROWS_AT_A_TIME):
         rows = slice(top, top + ROWS_AT_A_TIME)
-        share = np.maximum(alpha[rows, :, None] / full, 0.0)
-        values = np.divide(colours[rows], share, out=np.zeros(colours[rows].shape), where=share > 0.0)
+        opacity = np.maximum(alpha[rows, :, None] / full, 0.0)
+        values = np.divide(colours[rows], opacity, out=np.zeros(colours[rows].shape), where=opacity > 0.0)
         straight[rows] = np.rint(np.clip(values, 0, full)) if colours.dtype.kind in "ui" else values
     return straight
 
@@ -165,5 +165,5 @@ def as_opacity(alpha: Pixels, full: float) -> NDArray[np.uint8]:
     """Alpha of any sample type, which is ``full`` where the image is opaque, as 0..255."""
     if alpha.dtype == np.uint8 and full == OPAQUE:
         return np.asarray(alpha, dtype=np.uint8)
-    share = np.clip(np.nan_to_num(alpha.astype(np.float32) / full), 0.0, 1.0)
-    return np.asarray(np.rint(share * OPAQUE), dtype=np.uint8)
+    opacity = np.clip(np.nan_to_num(alpha.astype(np.float32) / full), 0.0, 1.0)
+    return np.asarray(np.rint(opacity * OPAQUE), dtype=np.uint8)

@@ -73,8 +73,8 @@ def _weighted_mean(corners: NDArray[Any], transparent: bool) -> NDArray[Any]:
     values = corners.astype(np.float32)
     mean: NDArray[Any] = values.mean(axis=0)
     if transparent:
-        share = values[..., -1:] / np.float32(np.iinfo(corners.dtype).max if integer else 1.0)
-        mean[..., :-1] = (values[..., :-1] * share).sum(axis=0) / np.maximum(share.sum(axis=0), np.float32(1e-6))
+        opacity = values[..., -1:] / np.float32(np.iinfo(corners.dtype).max if integer else 1.0)
+        mean[..., :-1] = (values[..., :-1] * opacity).sum(axis=0) / np.maximum(opacity.sum(axis=0), np.float32(1e-6))
     if integer:
         np.floor(mean + np.float32(0.5), out=mean)
     return np.ascontiguousarray(mean.astype(corners.dtype))

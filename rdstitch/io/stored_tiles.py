@@ -168,7 +168,7 @@ def _ome(file: Path, tiff: "tifffile.TiffFile") -> list[StoredTile]:
     root = ome_tree(tiff.ome_metadata)
     if root is None:
         return []
-    own, elsewhere = root.get("UUID", ""), root.find("BinaryOnly")
+    uuid, elsewhere = root.get("UUID", ""), root.find("BinaryOnly")
     if elsewhere is not None:
         root = ome_tree(_companion(file.parent / str(elsewhere.get("MetadataFile", ""))))
         if root is None:
@@ -181,7 +181,7 @@ def _ome(file: Path, tiff: "tifffile.TiffFile") -> list[StoredTile]:
         pixels = image.find("Pixels")
         if pixels is None:
             continue
-        planes = ome_planes(file, len(tiff.pages), pixels, None if by_name else own)
+        planes = ome_planes(file, len(tiff.pages), pixels, None if by_name else uuid)
         if any(page.file == file for page in planes.values()):
             tiles.append(_ome_tile(file, image, pixels, planes))
     shared = len(tiles) > 1

@@ -109,11 +109,11 @@ class DisplacementField:
 
     def bends(self, edges: FloatArray) -> FloatArray:
         """How far straight edges with such ends (K, 2, 2) are bent, measured pixels (K,)."""
-        share = np.linspace(0.0, 1.0, _EDGE_POINTS)[:, None, None]
-        moved = self(edges[:, 0] + share * (edges[:, 1] - edges[:, 0]))
+        fraction = np.linspace(0.0, 1.0, _EDGE_POINTS)[:, None, None]
+        moved = self(edges[:, 0] + fraction * (edges[:, 1] - edges[:, 0]))
         along = edges[:, 1] - edges[:, 0]
         normal = np.stack([-along[:, 1], along[:, 0]], axis=-1) / np.linalg.norm(along, axis=1, keepdims=True)
-        off = moved - (moved[0] + share * (moved[-1] - moved[0]))
+        off = moved - (moved[0] + fraction * (moved[-1] - moved[0]))
         return np.asarray(np.abs((off * normal).sum(axis=-1)).max(axis=0))
 
     @cached_property
@@ -128,11 +128,11 @@ def _extent(image_size: tuple[int, int]) -> FloatArray:
     return np.maximum(np.array(image_size) - 1.0, 1.0)
 
 
-def _cubic_weights(share: FloatArray) -> FloatArray:
+def _cubic_weights(at: FloatArray) -> FloatArray:
     """What the four nodes around a place count in a cubic B-spline, (..., 4), by its share of a cell (...)."""
-    left, square = 1.0 - share, share * share
+    left, square = 1.0 - at, at * at
     rest = left * left
-    weights = [rest * left, 4.0 + square * (3.0 * share - 6.0), 4.0 + rest * (3.0 * left - 6.0), square * share]
+    weights = [rest * left, 4.0 + square * (3.0 * at - 6.0), 4.0 + rest * (3.0 * left - 6.0), square * at]
     return np.stack(weights, axis=-1) * (1.0 / 6.0)
 
 
@@ -141,8 +141,8 @@ def _prefilter(count: int) -> FloatArray:
     """From values at nodes in a row to the coefficients of their cubic B-spline (count + 2 aprons, count)."""
     around = ((_APRON, _APRON), (0, 0))
     padded = np.pad(np.eye(count), around, mode="reflect", reflect_type="odd")
-    one, beside = np.eye(len(padded)), np.eye(len(padded), k=1)
-    values = (4.0 * one + beside + beside.T) / 6.0
+    one, next_to = np.eye(len(padded)), np.eye(len(padded), k=1)
+    values = (4.0 * one + next_to + next_to.T) / 6.0
     values[0, 1] = values[-1, -2] = 2.0 / 6.0
     return read_only(np.asarray(np.linalg.solve(values, padded), dtype=np.float64))
 

@@ -119,9 +119,9 @@ class PlacedMatches(Rows):
         """
         keypoint, count = np.empty(2 * len(self), dtype=np.intp), 0
         for _, chosen in self.of_image:
-            found, each = np.unique(self.points.reshape(-1, 2)[chosen] @ (1.0, 1.0j), return_inverse=True)
+            keypoints, each = np.unique(self.points.reshape(-1, 2)[chosen] @ (1.0, 1.0j), return_inverse=True)
             keypoint[chosen] = count + each
-            count += len(found)
+            count += len(keypoints)
         edges = sparse.coo_array((np.ones(len(self)), (keypoint[::2], keypoint[1::2])), (count, count))
         track = csgraph.connected_components(edges, directed=False)[1][keypoint[::2]]
         longest_first = np.argsort(-np.bincount(track), kind="stable")
@@ -141,8 +141,8 @@ class PlacedMatches(Rows):
     @cached_property
     def noise(self) -> float:
         """Median length of what a residual does not have in common with its neighbour's, and no smooth field mends."""
-        apart = self.residual - self.residual[self.neighbours]
-        return float(np.median(np.linalg.norm(apart, axis=1)) / np.sqrt(2.0))
+        differences = self.residual - self.residual[self.neighbours]
+        return float(np.median(np.linalg.norm(differences, axis=1)) / np.sqrt(2.0))
 
     def thinned(self, most: int) -> "PlacedMatches":
         """At most about so many of them, evenly, and no fewer than a few."""

@@ -70,13 +70,13 @@ def band_lens(
         return None
     _refuse_other_places([compared[k] for k in sure], coarse[sure])
     expected: Callable[[FloatArray], FloatArray] = partial(np.add, np.median(coarse[sure], axis=0))
-    camera, found = compared[0][0].camera, None
+    camera, lens = compared[0][0].camera, None
     for _ in range(_ROUNDS):
-        found = _fit(camera, [patch_shifts(*edges[k], expected) for k in sure])
-        if found is None:
+        lens = _fit(camera, [patch_shifts(*edges[k], expected) for k in sure])
+        if lens is None:
             return None
-        expected = partial(_seen_by_band, camera, found.homography, found.distortion)
-    return found
+        expected = partial(_seen_by_band, camera, lens.homography, lens.distortion)
+    return lens
 
 
 def _seen_by_band(camera: Camera, homography: FloatArray, distortion: float, points: FloatArray) -> FloatArray:

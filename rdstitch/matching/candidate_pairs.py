@@ -62,9 +62,9 @@ def first_pairs(features: FeatureStore, seed: int, positions: FloatArray | None 
     if alike is None or alike.ordered:
         chosen |= {(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + _SEQUENCE_NEIGHBOURS, count))}
     if alike is not None:
-        found = (features.counts > 0).tolist()
+        has_features = (features.counts > 0).tolist()
         best = ((i, j) for i, row in enumerate(alike.most_alike[:, :_RETRIEVED].tolist()) for j in row)
-        chosen |= {(min(i, j), max(i, j)) for i, j in best if found[i] and found[j]}
+        chosen |= {(min(i, j), max(i, j)) for i, j in best if has_features[i] and has_features[j]}
         chosen |= _top_pairs(alike, chosen, CANDIDATES * count // 2)
     return sorted(chosen)
 

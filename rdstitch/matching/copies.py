@@ -17,7 +17,7 @@ SAME_PX = 0.5
 
 _MIN_SAME = 0.9  # share of the matches that do: of an image that shows something else beside what is static, more move
 _NEAR = 0.02  # of the width and the height, that matches of a near copy move by at most: an overlap of 97 % at least
-_NOT_AT_ALL = np.eye(3)
+_IDENTITY = np.eye(3)
 
 
 def copies_of(pairs: Sequence[PairRegistration]) -> dict[int, int]:
@@ -25,7 +25,7 @@ def copies_of(pairs: Sequence[PairRegistration]) -> dict[int, int]:
     result: dict[int, int] = {}
     moved: dict[int, FloatArray] = {}  # from their first images
     for pair in sorted(pairs, key=lambda pair: pair.images):
-        before = moved.get(pair.image1, _NOT_AT_ALL)
+        before = moved.get(pair.image1, _IDENTITY)
         if pair.image2 not in result and _moves_within(pair, np.full(2, SAME_PX), before):
             result[pair.image2] = result.get(pair.image1, pair.image1)
             moved[pair.image2] = pair.relation.homography @ before
@@ -64,7 +64,7 @@ def without_copies(pairs: Sequence[PairRegistration], copies: Mapping[int, int])
     return result
 
 
-def _moves_within(pair: PairRegistration, limits: FloatArray, before: FloatArray = _NOT_AT_ALL) -> bool:
+def _moves_within(pair: PairRegistration, limits: FloatArray, before: FloatArray = _IDENTITY) -> bool:
     """Whether what both show moves by at most so many pixels (2,), by the corners first: they tell most pairs.
 
     From the original on, where image 1 is a copy to which ``before`` (3, 3) leads.

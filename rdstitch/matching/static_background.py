@@ -20,7 +20,7 @@ from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.system.late_imports import spatial
 
-_MIN_IMAGES, _MIN_SHARE = 3, 0.5
+_MIN_IMAGES, _MIN_STATIC = 3, 0.5
 """Images, in number and as a fraction, that pairs which move must connect: two could agree by chance."""
 
 _MAX_STATIC_MOTION = 1.0 / 3.0
@@ -127,4 +127,4 @@ def show_motion(pairs: Sequence[PairRegistration], count: int, threshold: float)
     """Whether pairs that do move connect a good part of the ``count`` images, so that this is no chance."""
     linked = [pair for pair in pairs if pair.relation and not is_static_pair(pair, threshold)]
     connected = connected_components(count, [pair.image1 for pair in linked], [pair.image2 for pair in linked])[0]
-    return len(connected) >= max(_MIN_IMAGES, _MIN_SHARE * count)
+    return len(connected) >= max(_MIN_IMAGES, _MIN_STATIC * count)

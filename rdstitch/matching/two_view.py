@@ -64,7 +64,7 @@ class PairRegistration:
         return np.asarray(np.nan_to_num(np.linalg.norm(expected - matched.points2, axis=1), nan=np.inf))
 
     @property
-    def own_errors(self) -> FloatArray:
+    def pairwise_errors(self) -> FloatArray:
         """How far each match, (M,), is from where the relation of the pair expects it, pixels."""
         return self.errors(lambda _first, _second, points: self.relation.transfer(points))
 

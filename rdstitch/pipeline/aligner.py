@@ -194,8 +194,8 @@ class Aligner:
             twice = {*distinct.copies, *distinct.near_copies}
             return alignment.with_messages([self._counted_once(twice)] if twice else [])
 
-        found, known = self._recalled("draft", task, lambda: (task.draft, task.found))
-        draft = complete(found)
+        drafted, draft_model = self._recalled("draft", task, lambda: (task.draft, task.draft_model))
+        draft = complete(drafted)
         if misfits := self._misfits(draft, distinct):
             with_them = self._drafted(pairs, counted=counted | misfits)
             if with_them.alignment.model != draft.model:  # so little new ground tells of motion, but not of the lens
@@ -204,7 +204,7 @@ class Aligner:
         def completed() -> Alignment:
             return complete(self._recalled("alignment", task, lambda: task.result))
 
-        return AlignedPairs(tuple(pairs), draft, completed=completed, known=known)
+        return AlignedPairs(tuple(pairs), draft, completed=completed, known=draft_model)
 
     def _distinct(self, pairs: Sequence[PairRegistration], counted: frozenset[int]) -> _DistinctPairs:
         """Which pairs are evidence; where all images show the same, all are."""
@@ -242,7 +242,7 @@ class Aligner:
         for ends, pair in distinct.registered.items():
             copies = near.keys() & {*ends}
             if concerned & {*ends} and len(copies) < 2 and alignment.used[[*ends]].all():
-                both = np.array([pair.errors(alignment.transfer), pair.own_errors])[:, pair.relation.inliers]
+                both = np.array([pair.errors(alignment.transfer), pair.pairwise_errors])[:, pair.relation.inliers]
                 for image in copies or ends:
                     errors.setdefault(image, []).append(both)
         medians = dict.fromkeys(concerned, np.zeros(2))

@@ -294,4 +294,4 @@ def _grid(
     else:
         known = [stored.get(source.path) or StoredTile(source.path, {}) for source in sources]
         grid = grid_from_tiles(known, size, options.pixel_size)
-    return grid if (sizes == sizes[0]).all() else replace(grid, own_sizes=sizes)
+    return grid if (sizes == sizes[0]).all() else replace(grid, tile_sizes=sizes)

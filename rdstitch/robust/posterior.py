@@ -95,10 +95,10 @@ class Prior:
         weight, mean, scatter = np.array(self.parts).T
         spread = np.hypot(scatter, std)
         part = int(np.argmax(np.log(weight / spread) - ((value - mean) / spread) ** 2 / 2.0))
-        found = float(value + (mean[part] - value) * (std / spread[part]) ** 2)
+        mode = float(value + (mean[part] - value) * (std / spread[part]) ** 2)
         for _ in range(_MODE_STEPS):
-            found -= (self.slope(found) + (found - value) / std**2) / (self.curvature(found) + std**-2)
-        return found
+            mode -= (self.slope(mode) + (mode - value) / std**2) / (self.curvature(mode) + std**-2)
+        return mode
 
 
 def prior_costs(priors: tuple[Prior, ...], values: FloatArray) -> FloatArray:

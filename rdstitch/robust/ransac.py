@@ -223,8 +223,10 @@ class _SolverState:
         """The start or its refinement, whichever is better."""
         problems = PairProblems(model, data, np.full(len(data), scale), None, self.solver.fixed_distortion)
         tilts = None if self.tilts is None else self.tilts[rows]
-        found, _ = refine_pairs(problems, start.homography, start.distortion, tilts, _LOCAL_STEPS, loose=True)
-        judged = Hypotheses.judged(problems.homography(found), found[:, 0], data, self.options.threshold, self.index)
+        refined, _ = refine_pairs(problems, start.homography, start.distortion, tilts, _LOCAL_STEPS, loose=True)
+        judged = Hypotheses.judged(
+            problems.homography(refined), refined[:, 0], data, self.options.threshold, self.index
+        )
         result = start.take(np.arange(len(data)))
         better = judged.cost < start.cost
         result.put(better, judged.take(better))

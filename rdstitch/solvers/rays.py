@@ -71,9 +71,9 @@ def rotation_of_two(bundle: FloatArray) -> FloatArray:
     For two rays the least-squares rotation (Kabsch) turns their bisector and their plane into each other.
     """
     first, second = bundle[:, :, 0], bundle[:, :, 1]
-    along, apart = _unit(first + second), _unit(first - second)
-    normal = np.cross(along, apart, axis=0)
-    frames = np.stack([along, apart, normal], axis=1)
+    along, across = _unit(first + second), _unit(first - second)
+    normal = np.cross(along, across, axis=0)
+    frames = np.stack([along, across, normal], axis=1)
     rotation: FloatArray = np.einsum("ikb,jkb->bij", frames[:, :, 1], frames[:, :, 0])
     return rotation
 

@@ -94,9 +94,9 @@ def _axis(grid: TileGrid, axis: int, read: Callable[[int], CoarseTile], factor: 
         places, nats = wide_peaks(tiles)
         if len(nats):
             best = int(nats.argmax())
-            found = Candidates(places, nats, min(tile.grain for tile in tiles))
+            candidates = Candidates(places, nats, min(tile.grain for tile in tiles))
             measured.append(places[best] * factor)
-            margins.append(max(0.0, float(nats[best]) - found.best_elsewhere(best)))
+            margins.append(max(0.0, float(nats[best]) - candidates.best_elsewhere(best)))
             if sum(margin > HUNDRED_TO_ONE for margin in margins) == _ENOUGH:
                 break
     return _Axis(np.asarray(step), np.array(measured).reshape(-1, 2), np.array(margins))

@@ -76,9 +76,9 @@ def _moved_tiles(
     for number, pair in enumerate(pairs.tolist()):
         for tile in pair:
             of_tile.setdefault(tile, []).append(number)
-    found: dict[int, FloatArray] = {}
+    offsets: dict[int, FloatArray] = {}
     for tile, numbers in of_tile.items():
-        if any(number in chosen or number in found for number in numbers):
+        if any(number in chosen or number in offsets for number in numbers):
             continue
         signs = [1.0 if pairs[number][1] == tile else -1.0 for number in numbers]
         moved = [s * (candidates[n].offsets - fitted.between(pairs[n])[0]) for s, n in zip(signs, numbers, strict=True)]
@@ -89,8 +89,8 @@ def _moved_tiles(
         margins = {move: move.nats - candidates[move.pair].best_elsewhere(move.candidate) for move in agreeing}
         supporting = {move: margin for move, margin in margins.items() if margin > 0.0}
         if len(supporting) > 1 and sum(supporting.values()) > HUNDRED_TO_ONE - ANYWHERE:
-            found |= {move.pair: candidates[move.pair].offsets[move.candidate] for move in supporting}
-    return found
+            offsets |= {move.pair: candidates[move.pair].offsets[move.candidate] for move in supporting}
+    return offsets
 
 
 def _largest_group(places: FloatArray, moves: Sequence[_Move], reach: float) -> tuple[FloatArray, list[_Move]]:

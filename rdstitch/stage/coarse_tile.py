@@ -26,7 +26,7 @@ class CoarseTile:
     noise: float  # variance of the noise of a pixel in units of the content
 
     @property
-    def content_share(self) -> float:
+    def content_fraction(self) -> float:
         """Share of the variance of the content that is none of noise."""
         return 1.0 - self.noise / CORRELATED / max(float(self.content.var()), 1e-12)
 

@@ -87,12 +87,14 @@ def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
     if not possible.any():  # in tiles of a few pixels
         return np.zeros((0, 2)), np.zeros(0)
     deviation = normal_std(surface[possible]) + 1e-12
-    found: dict[tuple[int, int], None] = {}
+    candidates: dict[tuple[int, int], None] = {}
     # A pattern that repeats itself is as high in many places of the plain correlation, and in chance ones of the other.
     for values, threshold in ((surface, peak_threshold(deviation, surface.size)), (plain, 0.0)):
         masked = np.where(possible, values, 0.0).astype(np.float32)
-        found |= dict.fromkeys((int(x[column]), int(y[row])) for column, row in peaks(masked, threshold, _WIDE_PEAKS))
-    places = np.array(list(found), dtype=np.float64).reshape(-1, 2)
+        candidates |= dict.fromkeys(
+            (int(x[column]), int(y[row])) for column, row in peaks(masked, threshold, _WIDE_PEAKS)
+        )
+    places = np.array(list(candidates), dtype=np.float64).reshape(-1, 2)
     boxes = [Overlap.expected(place, sizes[:, ::-1], 1) for place in places]
     return places, np.array([log_evidence(tiles, box, at) for at, box in zip(places, boxes, strict=True)])
 

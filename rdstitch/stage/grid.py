@@ -26,7 +26,7 @@ class TileGrid:
     size: tuple[int, int]  # width and height of the largest tile, pixels
     pixel_size: float | None = None  # micrometres, where it is known
     source: str = ""  # where the places come from, for reports
-    own_sizes: IntArray | None = None  # (N, 2): width and height of each tile, where they differ
+    tile_sizes: IntArray | None = None  # (N, 2): width and height of each tile, where they differ
 
     def __post_init__(self) -> None:
         if self.places.ndim != 2 or self.places.shape[1] != 2 or not np.isfinite(self.places).all():
@@ -39,7 +39,9 @@ class TileGrid:
     @property
     def sizes(self) -> IntArray:
         """Width and height of each tile, (N, 2)."""
-        return np.tile(np.array(self.size, dtype=np.intp), (len(self), 1)) if self.own_sizes is None else self.own_sizes
+        return (
+            np.tile(np.array(self.size, dtype=np.intp), (len(self), 1)) if self.tile_sizes is None else self.tile_sizes
+        )
 
     @property
     def rows(self) -> IntArray:

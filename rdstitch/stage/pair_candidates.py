@@ -94,29 +94,29 @@ class PairFinder:
 
     def candidates(self, read: Reader, known: float | None, progress: Progress) -> tuple[list[Candidates], float]:
         """Candidates of all pairs, and the λ by which they were found; where that is unknown, twice if need be."""
-        lens, scans = known or 0.0, known is None and self.grid.own_sizes is None
-        found, heights = self._each(read, lens, progress, scans=scans)
+        lens, scans = known or 0.0, known is None and self.grid.tile_sizes is None
+        candidates_of_pairs, heights = self._each(read, lens, progress, scans=scans)
         middle, best = len(_LENSES) // 2, int(heights.sum(axis=0).argmax())
         if best != middle and (heights[:, best] > heights[:, middle]).all():
             lens = float(_LENSES[best])
-            found, _ = self._each(read, lens, progress, scans=False)
-        return found, lens
+            candidates_of_pairs, _ = self._each(read, lens, progress, scans=False)
+        return candidates_of_pairs, lens
 
     def _each(
         self, read: Reader, lens: float, progress: Progress, *, scans: bool
     ) -> tuple[list[Candidates], FloatArray]:
         """Candidates of all pairs for a λ; of the lenses, the sums of peaks (2, L) along rows and along columns."""
         camera, heights = self.coarse.with_coefficients(lens), np.zeros((2, len(_LENSES)))
-        found = []
+        candidates = []
         pairs = in_pairs(lambda index: coarse_tile(read(index), self.factor), self.pairs)
         for number, tiles in enumerate(pairs):
             overlap = self.overlap(number)
             surfaces = correlate(tiles[0].pixels, tiles[1].pixels, overlap, self.radius + self.spare)
             if scans:
                 heights[int(np.abs(overlap.offset).argmax())] += self._heights(surfaces, overlap)
-            found.append(self._of_pair(number, tiles, surfaces, camera))
+            candidates.append(self._of_pair(number, tiles, surfaces, camera))
             progress("correlating", number + 1, len(self.pairs))
-        return found, heights
+        return candidates, heights
 
     def _heights(self, surfaces: Surfaces, overlap: Overlap) -> FloatArray:
         """The highest peak of a pair by each of the lenses (L,); 0 where all of them are noise."""
@@ -140,7 +140,7 @@ class PairFinder:
             if len(offsets) < len(likely) or value > HUNDRED_TO_ONE:
                 offsets.append(offset)
                 nats.append(value)
-        if max(nats, default=0.0) < WRONG_PEAK and min(tile.content_share for tile in tiles) > _MIN_CONTENT:
+        if max(nats, default=0.0) < WRONG_PEAK and min(tile.content_fraction for tile in tiles) > _MIN_CONTENT:
             places, values = wide_peaks(tiles)
             offsets, nats = [*offsets, *places], [*nats, *values.tolist()]
         return Candidates(self.factor * np.array(offsets).reshape(-1, 2), np.array(nats), self.factor * grain)

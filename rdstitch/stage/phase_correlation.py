@@ -92,7 +92,7 @@ def peak_threshold(deviation: float, places: int) -> float:
 
 
 def lay_tapered(
-    frame: Image, tile: Image, block: IntArray, margin: IntArray, corner: IntArray, share: float = _TAPER
+    frame: Image, tile: Image, block: IntArray, margin: IntArray, corner: IntArray, fraction: float = _TAPER
 ) -> float:
     """Lay a block with a margin, as far as the tile has it, tapered into a frame; return its spectrum's noise power."""
     low = np.maximum(block[:2] - margin, 0)
@@ -100,14 +100,14 @@ def lay_tapered(
     if (high - low < 4).any():
         return 0.0
     part = tile[low[1] : high[1], low[0] : high[0]]
-    weights = _taper(part.shape[0], share)[:, None] * _taper(part.shape[1], share)
+    weights = _taper(part.shape[0], fraction)[:, None] * _taper(part.shape[1], fraction)
     x, y = low - corner
     frame[y : y + part.shape[0], x : x + part.shape[1]] = (part - part.mean()) * weights
     return noise_variance(part) * float((weights**2).sum())
 
 
 @lru_cache(maxsize=64)
-def _taper(length: int, share: float) -> Image:
+def _taper(length: int, fraction: float) -> Image:
     """A window that falls to 0 as a cosine at both ends, over a share of its length."""
-    distance = (np.minimum(np.arange(length), np.arange(length)[::-1]) + 0.5) / max(1.0, share * length)
+    distance = (np.minimum(np.arange(length), np.arange(length)[::-1]) + 0.5) / max(1.0, fraction * length)
     return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.minimum(distance, 1.0)), dtype=np.float32)

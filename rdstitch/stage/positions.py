@@ -65,14 +65,14 @@ def grid_from_names(
     """
     if not 0.0 <= overlap < 100.0:
         raise ArgumentError(f"tiles overlap by 0 to less than 100 %, not {overlap:g} %")
-    scan, wanted, found = scan or Scan(), _compiled(pattern), []
+    scan, wanted, parts_of_names = scan or Scan(), _compiled(pattern), []
     for name in names:
         fitting = wanted.search(name)
         if fitting is None:
             raise ArgumentError(f"{name}: does not fit the grid '{pattern}'")
-        found.append(fitting.groupdict())
+        parts_of_names.append(fitting.groupdict())
     fitting_names = filter(None, map(wanted.search, [*names, *listed]))
-    cells = _cells(found, scan, [fitting.groupdict() for fitting in fitting_names])
+    cells = _cells(parts_of_names, scan, [fitting.groupdict() for fitting in fitting_names])
     if len(set(cells)) < len(cells):
         twice = next(cell for cell in cells if cells.count(cell) > 1)
         raise ArgumentError(f"several tiles are row {twice[1]}, column {twice[0]}; name those of one channel only")
@@ -98,14 +98,14 @@ def _compiled(pattern: str) -> re.Pattern[str]:
 
 
 def _cells(
-    found: Sequence[Mapping[str, str]], scan: Scan, listed: Sequence[Mapping[str, str]]
+    parts: Sequence[Mapping[str, str]], scan: Scan, listed: Sequence[Mapping[str, str]]
 ) -> list[tuple[int, int]]:
     """Column and row of each tile by what its name says: a running number, among all that were listed, or either."""
-    if "number" not in found[0]:
-        return [(int(item["col"]), int(item["row"]) if "row" in item else _number(item["letter"])) for item in found]
+    if "number" not in parts[0]:
+        return [(int(item["col"]), int(item["row"]) if "row" in item else _number(item["letter"])) for item in parts]
     numbers = [int(item["number"]) for item in listed]
     first, count = min(numbers), max(numbers) - min(numbers) + 1
-    return [scan.cell(int(item["number"]) - first, count) for item in found]
+    return [scan.cell(int(item["number"]) - first, count) for item in parts]
 
 
 def _number(letters: str) -> int:
@@ -134,7 +134,7 @@ def grid_from_table(
 def _fiji_rows(text: str, file: str | Path) -> list[Row]:
     """What Fiji's list of tiles says; nothing of other texts."""
     lines = enumerate(map(_FIJI.fullmatch, text.splitlines()), start=1)
-    return [Row(f"{file}: line {number}", found.groupdict(), ".") for number, found in lines if found is not None]
+    return [Row(f"{file}: line {number}", fitting.groupdict(), ".") for number, fitting in lines if fitting is not None]
 
 
 def grid_from_arrays(

@@ -62,11 +62,11 @@ def _refined(
 ) -> BlockMatches | None:
     """The match of one block; None where it shows nothing."""
     pair = _sampled_pair(first, second, block, transfer)
-    found = None if pair is None else _displaced(pair, min(tolerance, _MARGIN - 2.0))
-    if pair is None or found is None or not found.significant:
+    displaced = None if pair is None else _displaced(pair, min(tolerance, _MARGIN - 2.0))
+    if pair is None or displaced is None or not displaced.significant:
         return None
-    point = (pair.low + _centroid(found.gradient))[None]
-    return BlockMatches(point, transfer(point) - found.shift, found.information[None])
+    point = (pair.low + _centroid(displaced.gradient))[None]
+    return BlockMatches(point, transfer(point) - displaced.shift, displaced.information[None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +136,7 @@ def _displaced(pair: _SampledPair, tolerance: float) -> _Displaced | None:
     first, deviation = _centred(pair.block, weight)
     without_light = _without_illumination(first, weight)
     gradient1 = without_light(_gradient(first))
-    shift, found = np.zeros(2), None
+    shift, displaced = np.zeros(2), None
     for _ in range(_ITERATIONS):
         x, y = (pair.maps[..., k] - np.float32(shift[k]) for k in (0, 1))
         # Smoothed, so that linear interpolation will do; OpenCV's cubic kernel moves content by up to 0.05 pixels.
@@ -156,10 +156,10 @@ def _displaced(pair: _SampledPair, tolerance: float) -> _Displaced | None:
         shift = shift + np.clip(step, -1.0, 1.0)
         if np.abs(shift).max() > tolerance:
             return None
-        found = _Displaced(shift, first, second, weight, mean, hessian)
+        displaced = _Displaced(shift, first, second, weight, mean, hessian)
         if np.abs(step).max() < _SETTLED:
             break
-    return found
+    return displaced
 
 
 def _centred(image: Image, weight: Image) -> tuple[Image, float]:

@@ -73,7 +73,7 @@ def register_tiles(
 
     ``distortion``: λ, or "auto" to estimate it; else it is 0 unless pairs along rows and along columns agree on it.
     """
-    if distortion == "auto" and plan.grid.own_sizes is not None:
+    if distortion == "auto" and plan.grid.tile_sizes is not None:
         raise ArgumentError("tiles of different sizes do not show λ; give it with --lambda, or leave that out")
     pairs = plan.grid.neighbours(plan.search)
     known = distortion if isinstance(distortion, float | int) else None
@@ -109,7 +109,7 @@ def _with_lens(
     if isinstance(wanted, float | int):
         return replace(adjust(grid, links, std, float(wanted)), distortion_std=0.0)
     straight = adjust(grid, links, std)
-    if not len(links.pair) or grid.own_sizes is not None:
+    if not len(links.pair) or grid.tile_sizes is not None:
         return straight
     bent = adjust(grid, links, std, lens, free_lens=True)
     better = straight.cost(bent.noise) - bent.cost(bent.noise) > math.log(max(2, len(links.pair)))

@@ -66,15 +66,15 @@ def _as_tile(item: Any, index: int) -> Any:
 
 def with_position_folders(inputs: Sequence[Named]) -> list[Named]:
     """The inputs; a folder without images of its own stands for those of its folders that have some."""
-    found: list[Named] = []
+    named: list[Named] = []
     for item in inputs:
         folder = None if isinstance(item, Frame) or not Path(item).is_dir() else Path(item)
         if folder is None or _has_images(folder):
-            found.append(item)
+            named.append(item)
             continue
         inner = sorted((part for part in folder.iterdir() if part.is_dir()), key=natural_key)
-        found += [part for part in inner if _has_images(part)] or [item]
-    return found
+        named += [part for part in inner if _has_images(part)] or [item]
+    return named
 
 
 def _has_images(folder: Path) -> bool:

@@ -93,8 +93,8 @@ class Sequence:
         if self.relief is None:
             return self.to_image(index, ground)
         position, camera_height = self.poses.position[index], float(self.poses.height[index])
-        share = 1.0 - self.relief.at(ground) / camera_height
-        foot = position + (ground - position) / share[:, None]
+        fraction = 1.0 - self.relief.at(ground) / camera_height
+        foot = position + (ground - position) / fraction[:, None]
         hidden = np.linalg.norm(self._on_ground(index, foot) - ground, axis=1) > _HIDDEN
         return np.where(hidden[:, None], np.nan, self.to_image(index, foot))
 

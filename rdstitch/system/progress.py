@@ -11,11 +11,11 @@ def silent(stage: str, done: int, total: int) -> None:
     """A progress that nobody watches."""
 
 
-ShareProgress = Callable[[float], None]
-"""Called with the share of the work done, 0 to 1."""
+FractionProgress = Callable[[float], None]
+"""Called with the fraction of the work that is done, 0 to 1."""
 
 
-def unheard(share: float) -> None:
+def no_progress(fraction: float) -> None:
     """A progress of one stage that nobody watches."""
 
 

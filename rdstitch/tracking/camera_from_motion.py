@@ -121,10 +121,10 @@ def _covariance(errors: FloatArray, slope: FloatArray, pairs: int) -> FloatArray
     """Covariance (F, F) of what was fitted, by errors (2 K M,) that those of one pair may have in common."""
     freedom = slope.shape[1]
     inverse = np.linalg.pinv(slope.T @ slope, hermitian=True)
-    apart = float(errors @ errors) / max(len(errors) - 3 * pairs - freedom, 1)
+    variance = float(errors @ errors) / max(len(errors) - 3 * pairs - freedom, 1)
     of_pairs = (slope * errors[:, None]).reshape(2, pairs, -1, freedom).sum(axis=(0, 2))
     together = pairs / max(pairs - freedom, 1) * of_pairs.T @ of_pairs
-    return np.asarray(apart * inverse + _SHARED * inverse @ together @ inverse)
+    return np.asarray(variance * inverse + _SHARED * inverse @ together @ inverse)
 
 
 def _fitted(pairs: SeenPairs, start: FloatArray, free: list[int]) -> tuple[FloatArray, FloatArray, FloatArray]:

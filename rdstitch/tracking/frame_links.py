@@ -63,8 +63,8 @@ def links_by_features(
     frame: Frame, others: Sequence[TrackedFrame], match: Matcher, knowledge: CameraKnowledge
 ) -> list[Link]:
     """The same where nothing is known of its place."""
-    found = [(other, match(other.frame.features, frame.features)) for other in others]
-    return _registered(frame, [(other, m.points1, m.points2, -m.ratio) for other, m in found], knowledge)
+    matched = [(other, match(other.frame.features, frame.features)) for other in others]
+    return _registered(frame, [(other, m.points1, m.points2, -m.ratio) for other, m in matched], knowledge)
 
 
 def _registered(frame: Frame, matched: Sequence[Matched], knowledge: CameraKnowledge) -> list[Link]:

@@ -202,5 +202,5 @@ class KeyframeMap:
                 if again is not None:
                     placed.move_to(again)
                 revised.setdefault(placed.number, placed)
-        found = sorted(revised.items())
-        return [one for number, one in found if one.aligned and (waiting is None or number in waiting)]
+        by_number = sorted(revised.items())
+        return [one for number, one in by_number if one.aligned and (waiting is None or number in waiting)]

@@ -117,7 +117,7 @@ class TrackedFrame:
         there = other.placement
         return from_plane(there.camera, there.homography, self.placement.to_plane(points))
 
-    def share_shown_by(self, other: "TrackedFrame") -> float:
+    def overlap_with(self, other: "TrackedFrame") -> float:
         """Share of the frame that another one shows."""
         axes = [(np.arange(_GRID) + 0.5) * side / _GRID - 0.5 for side in self.frame.camera.image_size]
         points = self.points_in(other, np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2))

@@ -171,7 +171,7 @@ class FrameTracker:
 
     def _is_new(self, placed: TrackedFrame) -> bool:
         """Whether the last keyframe shows too little of it."""
-        return placed.share_shown_by(self._map.keyframes[-1]) < _KEYFRAME_OVERLAP
+        return placed.overlap_with(self._map.keyframes[-1]) < _KEYFRAME_OVERLAP
 
     def _add_keyframe(self, placed: TrackedFrame, links: list[Link]) -> list[TrackingResult]:
         """Keep the frame; take over an alignment of the last keyframes, which may place others, and begin the next."""

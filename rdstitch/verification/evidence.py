@@ -80,7 +80,9 @@ class ResultEvidence:
     @cached_property
     def alike_fraction(self) -> float:
         """How much alike images look where most pairs put them, [0, 1]; 0 where there is nothing to see."""
-        shares = [link.agreement.share for link in self.checked if link.agreement.cells >= Limits.min_cells]
+        shares = [
+            link.agreement.confirming_fraction for link in self.checked if link.agreement.cells >= Limits.min_cells
+        ]
         return float(np.median(shares)) if shares else 0.0
 
     @property

@@ -119,7 +119,7 @@ def wrong_at_most(checked: Sequence[CheckedLink]) -> float:
     sampled = [link.agreement for link in checked if link.sampled and link.agreement.cells >= cells]
     if not sampled:
         return 1.0
-    count, wrong, z = len(sampled), sum(each.share < unlike for each in sampled), _CONFIDENCE
+    count, wrong, z = len(sampled), sum(each.confirming_fraction < unlike for each in sampled), _CONFIDENCE
     middle = wrong + z**2 / 2.0
     return float((middle + z * np.sqrt(wrong * (count - wrong) / count + z**2 / 4.0)) / (count + z**2))
 
@@ -166,9 +166,9 @@ def _at_random(links: Sequence[LinkFit]) -> set[tuple[int, int]]:
 
 def _least_confirmed(links: Sequence[LinkFit]) -> set[tuple[int, int]]:
     """Images of the links in the fewest triangles, then of those with the fewest inliers."""
-    beside: dict[int, set[int]] = {}
+    neighbours: dict[int, set[int]] = {}
     for fit in links:
-        beside.setdefault(fit.image1, set()).add(fit.image2)
-        beside.setdefault(fit.image2, set()).add(fit.image1)
-    doubtful = sorted(links, key=lambda fit: (len(beside[fit.image1] & beside[fit.image2]), fit.inliers))
+        neighbours.setdefault(fit.image1, set()).add(fit.image2)
+        neighbours.setdefault(fit.image2, set()).add(fit.image1)
+    doubtful = sorted(links, key=lambda fit: (len(neighbours[fit.image1] & neighbours[fit.image2]), fit.inliers))
     return {fit.images for fit in doubtful[:_MAX_LINKS]}

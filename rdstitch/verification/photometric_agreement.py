@@ -51,7 +51,7 @@ class Agreement:
     coarse_similarity: float = math.nan
 
     @property
-    def share(self) -> float:
+    def confirming_fraction(self) -> float:
         """Share of the cells that confirm the registration; 1 without cells."""
         return self.confirming / self.cells if self.cells else 1.0
 
@@ -119,8 +119,8 @@ def _plain_frame(grey: Grey) -> NDArray[np.bool_]:
         rows = image[:, inside].astype(np.float64)
         known = np.isfinite(rows)
         count = np.maximum(known.sum(axis=1), 1)
-        apart = np.where(known, rows - np.where(known, rows, 0.0).sum(axis=1, keepdims=True) / count[:, None], 0.0)
-        texture = np.sqrt((apart**2).sum(axis=1) / count)
+        centred = np.where(known, rows - np.where(known, rows, 0.0).sum(axis=1, keepdims=True) / count[:, None], 0.0)
+        texture = np.sqrt((centred**2).sum(axis=1) / count)
         shown = np.flatnonzero(texture > _PLAIN * np.median(texture))
         if len(shown) and len(shown) < len(image):
             first, last = shown[[0, -1]]

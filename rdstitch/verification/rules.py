@@ -133,17 +133,21 @@ def _unlike(evidence: ResultEvidence) -> Iterator[Finding]:
     """
     for link in evidence.checked:
         alike = evidence.purpose.picture and link.agreement.coarse_similarity >= Limits.min_plane_fraction
-        if link.agreement.cells >= Limits.min_cells and link.agreement.share < Limits.max_unlike_fraction and not alike:
+        if (
+            link.agreement.cells >= Limits.min_cells
+            and link.agreement.confirming_fraction < Limits.max_unlike_fraction
+            and not alike
+        ):
             values = {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
             yield Finding(Kind.UNLIKE, link.pair, "failure", values)
 
 
 def _compared_overlaps(evidence: ResultEvidence) -> Iterator[Finding]:
     """How many of many overlaps were compared in their pixels, and what that says of the others."""
-    checked, share = evidence.checked, wrong_at_most(evidence.checked)
-    if share < Limits.max_wrong_overlaps:
+    checked, wrong_fraction = evidence.checked, wrong_at_most(evidence.checked)
+    if wrong_fraction < Limits.max_wrong_overlaps:
         sampled = sum(link.sampled for link in checked)
-        values = {"of": len(evidence.used), "count": len(checked), "sampled": sampled, "share": share}
+        values = {"of": len(evidence.used), "count": len(checked), "sampled": sampled, "share": wrong_fraction}
         yield Finding(Kind.OVERLAPS_SAMPLED, (), "detail", values)
 
 
@@ -158,14 +162,16 @@ def _pattern(evidence: ResultEvidence) -> Iterator[Finding]:
         yield Finding(Kind.PATTERN, values={"count": len(evidence.ambiguous), "of": len(evidence.checked)})
     settled = [link for link in evidence.checked if link.unique]
     if settled:
-        yield Finding(Kind.SETTLED_PATTERN, min(settled, key=lambda link: link.agreement.share).pair, "warning")
+        yield Finding(
+            Kind.SETTLED_PATTERN, min(settled, key=lambda link: link.agreement.confirming_fraction).pair, "warning"
+        )
 
 
 def _rival_motion(evidence: ResultEvidence) -> Iterator[Finding]:
     """Poses by something that fills less than half of the images: what drives ahead, say."""
-    share = max_plane_fraction(link.agreement for link in evidence.checked)
-    if share < Limits.min_plane_fraction:
-        yield Finding(Kind.RIVAL_MOTION, values={"share": share})
+    fraction = max_plane_fraction(link.agreement for link in evidence.checked)
+    if fraction < Limits.min_plane_fraction:
+        yield Finding(Kind.RIVAL_MOTION, values={"share": fraction})
 
 
 def _two_left(evidence: ResultEvidence) -> Iterator[Finding]:
@@ -244,6 +250,6 @@ OF_THE_WHOLE = (
 """Everything else, of one topic the gravest first."""
 
 
-def found(rules: Iterable[Rule], evidence: ResultEvidence) -> list[Finding]:
+def findings(rules: Iterable[Rule], evidence: ResultEvidence) -> list[Finding]:
     """What those of some rules find that apply to the recipe."""
     return [finding for rule in rules if evidence.purpose in rule.purposes for finding in rule.find(evidence)]

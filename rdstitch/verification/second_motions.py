@@ -44,15 +44,15 @@ def planes_of_pairs(registration: Registration, threshold: float, threads: int =
             return dict(zip(motions, pool.map(fills, motions, motions.values()), strict=True))
 
     half = Limits.min_plane_fraction
-    found = filled_by({pair.images: pair.relation for pair in pairs})
-    if all(share >= half for share, _ in found.values()):
+    planes = filled_by({pair.images: pair.relation for pair in pairs})
+    if all(fraction >= half for fraction, _ in planes.values()):
         return None
     for pair, filled in filled_by(second_motions(registration.alignment.cameras, pairs, threshold)).items():
-        found[pair] = max(found[pair], filled, key=lambda each: each[0])
-    needed = bottleneck_fraction({pair: share for pair, (share, _) in found.items() if share >= half})
+        planes[pair] = max(planes[pair], filled, key=lambda each: each[0])
+    needed = bottleneck_fraction({pair: fraction for pair, (fraction, _) in planes.items() if fraction >= half})
     return [
-        replace(pair, relation=found[pair.images][1] if found[pair.images][0] >= needed else _no_plane(pair))
-        if pair.images in found
+        replace(pair, relation=planes[pair.images][1] if planes[pair.images][0] >= needed else _no_plane(pair))
+        if pair.images in planes
         else pair
         for pair in registration.pairs
     ]

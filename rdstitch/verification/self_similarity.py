@@ -90,21 +90,21 @@ def draw(image: ComparedImage, scale: float, longest_side: int = MAX_SIDE, coars
 
 def placement_ambiguity(first: Drawing, second: Drawing, longest_side: int = MAX_SIDE) -> Ambiguity:
     """Compare two images, drawn at the same scale, at all shifts on the plane."""
-    share = longest_side / MAX_SIDE
+    reduction = longest_side / MAX_SIDE
     overlaps = Overlaps.of(first.pixels, second.pixels)
     # Position of the first image within the second: rows and columns count from -(size - 1) of the first.
     rows, columns = (np.arange(n) - (m - 1) for n, m in zip(overlaps.area.shape, first.pixels.shape, strict=True))
     right, down = np.rint(first.origin - second.origin)
     distance = np.hypot((rows - down).astype(np.float32)[:, None], (columns - right).astype(np.float32))
-    near = distance <= share * SLACK
+    near = distance <= reduction * SLACK
     most = float(overlaps.area[near].max(initial=0.0))
     if not most > 0:
         return Ambiguity(0.0, 0.0, 0.0)
     score = overlaps.correlation()
     # A peak of its own, not the flank of the one here.
-    peak = score >= cv2.dilate(score, np.ones((2 * math.ceil(share * SLACK) + 1,) * 2, dtype=np.uint8))
+    peak = score >= cv2.dilate(score, np.ones((2 * math.ceil(reduction * SLACK) + 1,) * 2, dtype=np.uint8))
     enough = overlaps.area >= Limits.min_kept_overlap * most
-    other = np.where(peak & (distance > share * _MIN_SHIFT) & enough, score, np.float32(0.0))
+    other = np.where(peak & (distance > reduction * _MIN_SHIFT) & enough, score, np.float32(0.0))
     best = int(other.argmax())
     elsewhere = float(other.flat[best]) and _between_pixels(score, *np.unravel_index(best, score.shape))
     return Ambiguity(float(score[near].max()), elsewhere, float(distance.flat[best]) / longest_side)

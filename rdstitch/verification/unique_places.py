@@ -35,16 +35,16 @@ class UniqueShift:
 
     # (2,): (x, y) by which the first image must be moved on the plane, pixels of the drawings or units of the plane
     shift: FloatArray
-    # what is unique in both and the same, in squared spreads of the pattern times pixels, times ``share``
+    # what is unique in both and the same, in squared spreads of the pattern times pixels, times ``correlation``
     matched: float
-    share: float  # of what is unique in either, in the overlap: their correlation, in [-1, 1]
+    correlation: float  # of what is unique in either, in the overlap, in [-1, 1]
     matched_elsewhere: float  # the most that is matched so at any other shift
 
     @property
     def decides(self) -> bool:
         """Whether the images lie here and nowhere else."""
         clear = self.matched >= max(Limits.min_matched_departures, Limits.min_lead * self.matched_elsewhere)
-        return clear and self.share >= Limits.min_departure_correlation
+        return clear and self.correlation >= Limits.min_departure_correlation
 
 
 def unique_shifts(
@@ -118,15 +118,15 @@ def unique_shift(first: Drawing, second: Drawing, unique1: Grey, unique2: Grey) 
     if not len(shifts):
         return None
     overlaps = Overlaps.of(unique1, unique2)
-    matched, share = np.zeros(len(shifts)), np.zeros(len(shifts))
+    matched, scores = np.zeros(len(shifts)), np.zeros(len(shifts))
     for k, (row, column) in enumerate(places.tolist()):
         box = slice(row - 1, row + 2), slice(column - 1, column + 2)
-        share[k] = overlaps.correlation(box).max(initial=0.0)
-        matched[k] = share[k] * overlaps.products[box].max(initial=0.0)
+        scores[k] = overlaps.correlation(box).max(initial=0.0)
+        matched[k] = scores[k] * overlaps.products[box].max(initial=0.0)
     best = int(matched.argmax())
     elsewhere = np.hypot(*(shifts - shifts[best]).T) > _MIN_SHIFT
     best_elsewhere = float(matched[elsewhere].max(initial=0.0))
-    return UniqueShift(shifts[best], float(matched[best]), float(share[best]), best_elsewhere)
+    return UniqueShift(shifts[best], float(matched[best]), float(scores[best]), best_elsewhere)
 
 
 def _peaks(overlaps: Overlaps, first: Grey, offset: FloatArray, least_overlap: float) -> tuple[FloatArray, IntArray]:

@@ -46,17 +46,17 @@ def judge(evidence: ResultEvidence) -> tuple[Finding, ...]:
     """
     if failures := failures_of_matches(evidence):
         return failures
-    decisive, outvoted = _split_by_dependence(rules.found(rules.OF_PAIRS, evidence), evidence)
-    whole = rules.found(rules.OF_THE_WHOLE, evidence)
+    decisive, outvoted = _split_by_dependence(rules.findings(rules.OF_PAIRS, evidence), evidence)
+    whole = rules.findings(rules.OF_THE_WHOLE, evidence)
     return _limit_warnings([*decisive, *whole, *_outvoted(outvoted)])
 
 
 def failures_of_matches(evidence: ResultEvidence) -> tuple[Finding, ...]:
     """Failures by matches alone: where there are any, pixels are not looked at before images are left out."""
-    found = rules.found(rules.OF_MATCHES, evidence)
+    findings = rules.findings(rules.OF_MATCHES, evidence)
     if evidence.static:  # matches of what is static in the images agree with nothing
-        return tuple(finding for finding in found if not finding.images)
-    return *found, *_split_by_dependence(rules.found(rules.OF_MATCHED_PAIRS, evidence), evidence)[0]
+        return tuple(finding for finding in findings if not finding.images)
+    return *findings, *_split_by_dependence(rules.findings(rules.OF_MATCHED_PAIRS, evidence), evidence)[0]
 
 
 def _split_by_dependence(
@@ -66,8 +66,8 @@ def _split_by_dependence(
     by_pair = {(finding.images[0], finding.images[1]): finding for finding in suspicions}
     count = len(evidence.registration.sources)
     decisive = set[Pair]() if evidence.static else set(decisive_pairs(by_pair, evidence.used, count))
-    found = [finding for pair, finding in by_pair.items() if pair in decisive]
-    return found, [finding for pair, finding in by_pair.items() if pair not in decisive]
+    essential = [finding for pair, finding in by_pair.items() if pair in decisive]
+    return essential, [finding for pair, finding in by_pair.items() if pair not in decisive]
 
 
 def decisive_pairs(suspicious: Collection[Pair], used: Sequence[LinkFit], count: int) -> list[Pair]:

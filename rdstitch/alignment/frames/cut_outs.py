@@ -66,14 +66,14 @@ def framed_link(link: Link, size: Size) -> Link:
 def cut_alignment(alignment: Alignment, sizes: Sequence[Size]) -> Alignment:
     """The alignment of images of these sizes, by that of frames with them in their middles."""
     framed, size = alignment.cameras, alignment.cameras[0].image_size
-    ratios = np.array([math.hypot(*own) / math.hypot(*size) for own in sizes])
+    ratios = np.array([math.hypot(*image_size) / math.hypot(*size) for image_size in sizes])
     reference = float(ratios[alignment.reference])
     homographies = alignment.homographies * np.stack([ratios, ratios, np.ones(len(ratios))], axis=1)[:, None]
     if alignment.poses is None and not alignment.on_sphere:  # the plane is the undistorted reference image
         homographies = homographies / np.array([reference, reference, 1.0])[:, None]
     powers = _powers(reference)
     units = np.array([powers.get(name, 1.0) for name in alignment.parameters])
-    cameras = tuple(_cut_camera(camera, own) for camera, own in zip(framed, sizes, strict=True))
+    cameras = tuple(_cut_camera(camera, image_size) for camera, image_size in zip(framed, sizes, strict=True))
     return replace(
         alignment, cameras=cameras, homographies=homographies, covariance=units[:, None] * alignment.covariance * units
     )

@@ -173,8 +173,8 @@ class BlockCholesky:
 
 @lru_cache(maxsize=8)
 def _remembered(count: int, image1: bytes, image2: bytes) -> tuple[tuple[Fronts, ...], BoolArray]:
-    found = Elimination.of(count, *(np.frombuffer(ends, np.int64) for ends in (image1, image2)))
-    return found.fronts, found.turned
+    elimination = Elimination.of(count, *(np.frombuffer(ends, np.int64) for ends in (image1, image2)))
+    return elimination.fronts, elimination.turned
 
 
 def _lower_inverse(lower: FloatArray) -> FloatArray:
@@ -298,8 +298,8 @@ def _coordinates(graph: "sparse.csr_array", part: IntArray) -> FloatArray:
     lengths = both + far * float(len(part))
 
     def distances(images: IntArray) -> FloatArray:
-        found: FloatArray = csgraph.dijkstra(lengths, directed=False, indices=images, min_only=True)
-        return found
+        lengths_of_paths: FloatArray = csgraph.dijkstra(lengths, directed=False, indices=images, min_only=True)
+        return lengths_of_paths
 
     def farthest(away: FloatArray) -> IntArray:
         """Of each part the image that is farthest away."""

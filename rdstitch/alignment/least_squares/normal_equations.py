@@ -96,9 +96,9 @@ class SparseNormalEquations:
         parameters (N, D, S), and the one of these (S, S).
         """
         by_shared, of_shared = self.responses(np.zeros_like(self.coupling), -np.eye(len(self.shared)))
-        own = np.where(self.free[:, :, None] & self.free[:, None], self._least_damped.inverse_diagonal(), 0.0)
+        conditional = np.where(self.free[:, :, None] & self.free[:, None], self._least_damped.inverse_diagonal(), 0.0)
         moved = -self._least_damped.solve(self.coupling)  # how poses follow a unit step of each shared parameter
-        return own + by_shared @ moved.swapaxes(1, 2), by_shared, of_shared
+        return conditional + by_shared @ moved.swapaxes(1, 2), by_shared, of_shared
 
     def _coupled(self, poses: FloatArray) -> FloatArray:
         """``B' x`` (S, C) of some (N, D, C)."""
@@ -197,14 +197,16 @@ def assemble(
         moving = np.concatenate([free[images[0]], free[images[1]], np.ones((len(local), others))], axis=1)
         local, gradient = local * moving[:, :, None] * moving[:, None, :], gradient * moving
         of_links[links] = local[:, size:pair, :size]
-        for of, own in zip(images, (slice(size), slice(size, pair)), strict=True):
+        for of, of_pose in zip(images, (slice(size), slice(size, pair)), strict=True):
             # One row for each image: its block, its rows of the coupling, and its gradient.
-            rows = np.concatenate([local[:, own, own], local[:, own, pair:], gradient[:, own, None]], axis=2)
+            rows = np.concatenate(
+                [local[:, of_pose, of_pose], local[:, of_pose, pair:], gradient[:, of_pose, None]], axis=2
+            )
             # Summed over the links of each image.
             order = np.argsort(of, kind="stable")
-            found, first_link = np.unique(of[order], return_index=True)
-            sums = sparse.csr_array((np.ones(len(of)), order, np.append(first_link, len(of))), (len(found), len(of)))
-            by_image[found] += sums @ rows.reshape(len(rows), -1)
+            present, first_link = np.unique(of[order], return_index=True)
+            sums = sparse.csr_array((np.ones(len(of)), order, np.append(first_link, len(of))), (len(present), len(of)))
+            by_image[present] += sums @ rows.reshape(len(rows), -1)
         shared += local[:, pair:, pair:].sum(axis=0)
         gradient_shared += gradient[:, pair:].sum(axis=0)
     poses, coupling, gradient_poses = np.split(by_image.reshape(count, size, -1), [size, size + others], axis=2)

@@ -88,8 +88,8 @@ class MotionModel(ABC):
         self, other: "MotionModel", poses: FloatArray, shared: FloatArray, attitudes: FloatArray
     ) -> FloatArray:
         """Poses of another model as those of this one that come nearest to them, with its shared parameters."""
-        own = shared if self.one_camera else np.empty(0)
-        return self.nearest_poses(other.matrices(poses, shared).matrices, own, attitudes)
+        of_camera = shared if self.one_camera else np.empty(0)
+        return self.nearest_poses(other.matrices(poses, shared).matrices, of_camera, attitudes)
 
     @abstractmethod
     def description(self, poses: FloatArray, shared: FloatArray) -> str:

@@ -39,7 +39,7 @@ def _seams(scene: Scene, options: CompositeOptions) -> NDArray[np.bool_]:
     with prepare_composite(decide(scene.images, scene.canvas, options)) as ready:
         seams = ready.renderer.seams
     box = (0, 0, *scene.canvas.size)
-    shares = np.stack([seams.share(k, box) for k in range(len(scene.frames))])
+    shares = np.stack([seams.weights(k, box) for k in range(len(scene.frames))])
     owner = np.where(shares.max(axis=0) > 0, shares.argmax(axis=0), -1)
     edges = np.zeros(owner.shape, np.uint8)
     edges[:, 1:] |= owner[:, 1:] != owner[:, :-1]

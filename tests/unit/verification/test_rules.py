@@ -48,7 +48,7 @@ def _depth(alike: float, purpose: Purpose = Purpose.TRAJECTORY, size: float = 0.
     ],
 )
 def test_of_what_is_not_flat_the_gravest_warns_where_it_matters(found: ResultEvidence, warned: list[Kind]) -> None:
-    findings = _limit_warnings(rules.found(rules.OF_THE_WHOLE, found))
+    findings = _limit_warnings(rules.findings(rules.OF_THE_WHOLE, found))
     assert [finding.kind for finding in findings if finding.severity == "warning"] == warned
     assert any(finding.kind in (Kind.RELIEF, Kind.DEPTH_OF_A_TURN) for finding in findings)
 
@@ -105,7 +105,7 @@ def test_every_kind_has_a_sentence_that_its_rules_find_all_words_for() -> None:
         evidence(registration(zoomed), checked=[]),
     ]
     found = [
-        (each, rules.found((*rules.OF_MATCHES, *rules.OF_PAIRS, *rules.OF_THE_WHOLE), each)) for each in everything
+        (each, rules.findings((*rules.OF_MATCHES, *rules.OF_PAIRS, *rules.OF_THE_WHOLE), each)) for each in everything
     ]
     found.append((FLAT, _outvoted([Finding(Kind.UNLIKE, (0, 1)), Finding(Kind.AMBIGUOUS, (1, 2))])))
     assert {finding.kind for _, findings in found for finding in findings} == set(Kind)
@@ -128,7 +128,7 @@ def test_poses_by_what_fills_less_than_half_of_the_images_are_none(
 ) -> None:
     """A truck that drives ahead, say: four fifths of the images lie over each other, and most of that is unlike."""
     link = replace(_checked(0.1, (0, 1), unique=False), agreement=Agreement(80, 8, 100, coarse))
-    found = rules.found(rules.OF_THE_WHOLE, evidence(registration(), purpose, checked=[link]))
+    found = rules.findings(rules.OF_THE_WHOLE, evidence(registration(), purpose, checked=[link]))
     assert [finding.severity for finding in found if finding.kind is Kind.RIVAL_MOTION] == severity
 
 
@@ -160,7 +160,7 @@ def test_matches_of_a_picture_may_disagree_where_it_is_more_alike_than_by_chance
 def _found(given: ResultEvidence, *kinds: Kind) -> list[Finding]:
     """Findings of some kinds, of images whose pixels say nothing unless they are given."""
     vars(given).setdefault("checked", [])
-    every = rules.found((*rules.OF_MATCHES, *rules.OF_PAIRS, *rules.OF_THE_WHOLE), given)
+    every = rules.findings((*rules.OF_MATCHES, *rules.OF_PAIRS, *rules.OF_THE_WHOLE), given)
     return [finding for finding in every if finding.kind in kinds]
 
 

@@ -153,7 +153,7 @@ def test_stains_say_by_how_many_periods_an_image_is_off(periods: tuple[int, int]
     placed = {0: _image(TWO, 150, 100, put), 4: _image(TWO, 213, 128, seed=1)}
     found = unique_shifts(placed, [(0, 4)])[0, 4]
     assert found.shift * LENS.scale == pytest.approx([-put[0], -put[1]], abs=1.0)
-    assert found.share > 0.9
+    assert found.correlation > 0.9
     assert found.matched_elsewhere < found.matched / 3.0
 
 
