@@ -23,12 +23,12 @@ Solve = Callable[[FloatArray, FloatArray, FloatArray | None], Solutions]
 class MinimalSolver:
     """A minimal solver."""
 
-    name: str  # as the user names it
+    name: str  # as RadialHomography.solver reports it
     sample_size: int
     # maps points (B, sample_size, 2) of both images, in the half-diagonal frame, and the known tilts (B, 2, 2) of both
     # images of each sample, radians, or None, to solutions in that frame
     solve: Solve
-    model: PairModel  # the model that the solver assumes; its solutions are refined with it first
+    model: PairModel  # the model that the solver assumes, in which solutions with few inliers are refined
     fixed_distortion: bool = False  # whether λ is known
 
 

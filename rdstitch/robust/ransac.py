@@ -199,10 +199,10 @@ class _SolverState:
         return homography, distortion, min_cost
 
     def _optimized(self, start: Hypotheses, data: Measurements, rows: IntArray) -> Hypotheses:
-        """The best of each hypothesis, its refinement in the model it assumes, and from there as a free homography.
+        """Each hypothesis or its refinement, whichever is better.
 
-        Where the solver assumes none, one refinement is enough to count inliers by; the choice of the model refines the
-        last of them again.
+        It is refined once: as a free homography where it has inliers enough, else in the model that the solver assumes.
+        The choice of the model refines the best of them again.
         """
         wide = 3.0 * self.options.threshold
         if isinstance(self.solver.model, HomographyPairModel):

@@ -1,11 +1,12 @@
 """All real roots of a batch of scalar equations, each inside its own interval.
 
-Every minimal problem of this package is one polynomial equation in λ per sample. The polynomial is known by its values
-at Chebyshev nodes of the sample's interval; one matrix product turns them into Bernstein coefficients on a few cells.
-By Descartes' rule a cell whose coefficients never change sign has no root, and one with a single change has exactly
-one. Cells with more changes are divided until they are isolated or as good as double; none is missed, as on a grid of
-samples. Newton's method on the Chebyshev series finds each root, and its last steps use the equation itself, which
-is better conditioned than the polynomial through its values.
+All minimal problems of this package but that of :func:`rdstitch.solvers.three_point` are one polynomial equation per
+sample, in λ or in the focal length. The polynomial is known by its values at Chebyshev nodes of the sample's interval;
+one matrix product turns them into Bernstein coefficients on a few cells. By Descartes' rule a cell whose coefficients
+never change sign has no root, and one with a single change has exactly one. Cells with more changes are divided until
+they are isolated or as good as double; none is missed, as on a grid of samples. Newton's method on the Chebyshev series
+finds each root, and its last steps use the equation itself, which is better conditioned than the polynomial through its
+values.
 """
 
 from collections.abc import Sequence
@@ -42,10 +43,10 @@ _MAX_POLISHING_STEP = 1e-2
 
 
 class Equation(Protocol):
-    """One polynomial equation in λ for each sample of a batch."""
+    """One polynomial equation in one unknown for each sample of a batch."""
 
-    def polynomial(self, distortion: FloatArray) -> FloatArray:
-        """Value of the polynomial, as accurate as possible, for λ of shape (..., B)."""
+    def polynomial(self, unknown: FloatArray, /) -> FloatArray:
+        """Value of the polynomial, as accurate as possible, for values of the unknown of shape (..., B)."""
 
     def take(self, samples: IndexArray) -> Self:
         """The equations of some samples; indices may repeat."""

@@ -36,7 +36,7 @@ _STEPS = 10
 _MAX_STEP = 0.4
 # Newton's method squares the error: after a step this short there is only rounding error left.
 _CONVERGED = 1e-8
-_MAX_FINAL_RESIDUAL = 1e-2
+_MERGED = 1e-2  # distance of states (a, b, λ) after the rough steps below which they are one
 _SAME = 1e-6
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 # A plane seen at more than 63 degrees from the vertical is given up.
@@ -191,7 +191,7 @@ def newton(system: DistanceSystem, starts: FloatArray) -> tuple[IndexArray, Floa
         length = np.abs(step).max(axis=0)
         state = state + step * np.minimum(1.0, _MAX_STEP / length)
         done = length < _CONVERGED
-        going = (length >= _CONVERGED) & (np.abs(state).max(axis=0) < _MAX_TILT_TANGENT)
+        going = (length >= _CONVERGED) & _visible(state)
         samples.append(origin[done])
         states.append(state[:, done])
         if not going.any():
@@ -203,11 +203,16 @@ def newton(system: DistanceSystem, starts: FloatArray) -> tuple[IndexArray, Floa
 
 def _leaders(state: RealArray) -> BoolArray:
     """Select the first of the states (3, S, B) of each sample that have met, unless it is impossible; (S B,)."""
-    leads: BoolArray = np.abs(state).max(axis=0) < _MAX_TILT_TANGENT
+    leads = _visible(state)
     for later in range(1, state.shape[1]):
         distance = np.abs(state[:, :later] - state[:, later, None]).max(axis=0)
-        leads[later] &= ~(distance < _MAX_FINAL_RESIDUAL).any(axis=0)
+        leads[later] &= ~(distance < _MERGED).any(axis=0)
     return leads.ravel()
+
+
+def _visible(state: RealArray) -> BoolArray:
+    """Whether a camera of each state (a, b, λ), (3, ...), is not tilted too far."""
+    return np.asarray(np.abs(state[:2]).max(axis=0) < _MAX_TILT_TANGENT)
 
 
 def _different(sample: IndexArray, state: FloatArray) -> tuple[IndexArray, FloatArray]:

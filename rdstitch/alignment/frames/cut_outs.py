@@ -13,6 +13,7 @@ import numpy as np
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
+from rdstitch.geometry.division_model import MAX_ABS_DISTORTION
 from rdstitch.matching.links import Link
 
 Size = tuple[int, int]
@@ -86,14 +87,17 @@ def _cut_camera(camera: Camera, size: Size) -> Camera:
 
 
 def _with_scaled_lens(camera: Camera, ratio: float) -> Camera:
-    """The same lens where half the diagonal is so many times as long."""
+    """The same lens where half the diagonal is so many times as long.
+
+    λ is what a camera of that size can have at the most: only one pair's estimate is beyond, where no match reaches.
+    """
     powers = _powers(ratio)
     units, covariance = np.array([powers[name] for name in LENS_PARAMETERS]), camera.lens_covariance
     if covariance is not None:
         covariance = tuple(map(tuple, (units[:, None] * np.array(covariance) * units).tolist()))
     return replace(
         camera,
-        distortion=camera.distortion * powers["distortion"],
+        distortion=min(camera.distortion * powers["distortion"], MAX_ABS_DISTORTION),
         distortion2=camera.distortion2 * powers["distortion2"],
         distortion3=camera.distortion3 * powers["distortion3"],
         distortion_std=None if camera.distortion_std is None else camera.distortion_std * powers["distortion"],

@@ -70,3 +70,13 @@ def test_smaller_copies_and_images_of_one_size_are_no_cut_outs() -> None:
         for k in given.links
     ]
     assert common_size(cameras, links) is None
+
+
+def test_a_pair_s_wild_estimate_of_a_crop_does_not_end_the_alignment() -> None:
+    """λ of a pair alone may be off; in the larger frame it would fold the corners, where the pair has no match."""
+    given = grid_scene(2, 2, (0.3, 0.25), 0.1, seed=4)
+    link = given.links[0]
+    wild = replace(link, relation=replace(link.relation, camera=link.relation.camera.with_coefficients(0.48)))
+    framed = framed_link(wild, (1280, 960))
+    assert framed.relation.distortion < 1.0
+    np.testing.assert_allclose(framed.points1, link.points1 + np.array([320.0, 240.0]))

@@ -143,6 +143,13 @@ def test_three_point_uses_a_warm_start() -> None:
     assert np.abs(found.distortion - same.distortion[0]).min() < 1e-9
 
 
+def test_three_point_limits_the_tilt_and_not_the_distortion() -> None:
+    """Of a long lens λ is large where points are normalized by the focal length."""
+    instances = planar_instances(COUNT, 3, seed=SEED, half_size=(0.25, 0.2), distortion=(-3.5, -2.2), max_tilt=0.1)
+    error, _ = instances.best_errors(solvers.three_point(instances.x1, instances.x2, distortion_range=(-6.0, 0.5)))
+    assert np.mean(error < 1e-3) > 0.9
+
+
 def test_four_point_offers_both_constraints_under_noise() -> None:
     instances = planar_instances(COUNT, 4, seed=SEED, noise=1e-3)
     error, _ = instances.best_errors(solvers.four_point(instances.x1, instances.x2))
