@@ -26,6 +26,7 @@ from rdstitch.alignment.sentences import (
 )
 from rdstitch.alignment.starts import start_from
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
+from rdstitch.choices import ModelName
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.delays import DELAY_STD, DELAYS, at_delay, smooth
 from rdstitch.results.messages import Message
@@ -37,7 +38,7 @@ _SCATTERS = np.append(0.0, np.radians(np.geomspace(0.01, 45.0, 60)))  # standard
 _EXACT = math.radians(0.01)  # nothing is mounted more exactly
 _STRAINED = 2.0  # standard deviations of a given focal length by which it must have given way to be looked at again
 
-_WITH_TILTS = ["tilting"]
+_WITH_TILTS: list[ModelName] = ["tilting"]
 
 LATE = 3.0
 """Standard deviations from which on a delay is one."""

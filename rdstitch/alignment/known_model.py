@@ -11,13 +11,14 @@ from rdstitch.alignment.least_squares.bundle_adjustment import Parameters
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.select import ModelChoice
 from rdstitch.arrays import BoolArray, IntArray
+from rdstitch.choices import ModelName
 
 
 @dataclass(frozen=True, eq=False)
 class KnownModel:
     """The model that was chosen, and its solution."""
 
-    model: str
+    model: ModelName
     images: IntArray  # (N,): those aligned, of all images
     reference: int  # the one that fixes the gauge, of all images
     parameters: Parameters

@@ -178,7 +178,7 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
     problem = replace(problem, overdispersion=max(shared, choice.fit.overdispersion))
     problem, fit = adjust_over_relief(problem, choice)
     fit = from_another_start(problem, fit)
-    if len(options.lenses) > 1:
+    if options.lens == "auto":
         problem, fit = with_third_coefficient(problem, fit)
     on_map = adjust_to_map(problem, fit)
     problem, fit = on_map.problem, on_map.fit
@@ -208,7 +208,7 @@ def _with_checked_focal(adjusted: AdjustedImages, stated: AlignmentOptions) -> A
     if adjusted.covariance is None or not is_strained(adjusted.all_links.camera_priors, adjusted.choice.fit):
         return build_alignment(adjusted)
     given = adjusted.given
-    cameras = [camera.without_focal().with_focal() for camera in given.cameras]
+    cameras = [camera.without_focal().with_guessed_focal() for camera in given.cameras]
     # A tilt that was given as wrong as the focal length would speak for it, and against a right one.
     only_tilt = given.options.attitudes is None and given.options.tilt is not None
     options = replace(given.options, tilt=None) if only_tilt else given.options

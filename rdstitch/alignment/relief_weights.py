@@ -21,7 +21,7 @@ from rdstitch.alignment.parallax import Parallax
 from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.alignment.starts import fit_model, start_from
 from rdstitch.arrays import FloatArray
-from rdstitch.choices import Purpose
+from rdstitch.choices import ModelName, Purpose
 from rdstitch.robust.loss import NORMAL_MEDIAN
 
 _MIN_IMAGES = 3  # images: of two, tilts do what heights do, and the errors do not show which
@@ -38,7 +38,9 @@ _SIGNIFICANT = 3.0
 """Standard deviations of the logarithm of their ratio by which errors along the parallax must exceed those across."""
 
 
-def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[str], purpose: Purpose) -> ModelChoice:
+def choose_over_relief(
+    problem: Problem, choice: ModelChoice, names: Sequence[ModelName], purpose: Purpose
+) -> ModelChoice:
     """The model of one camera chosen again, with heights that account for errors, where such heights show.
 
     Freeing the distortion centre is not tried: over relief it bends the whole as the ground bends the images.

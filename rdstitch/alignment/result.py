@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment.motion_models import LOG_HEIGHT, MODELS, PSI, THETA, YAW, X, Y
 from rdstitch.arrays import FloatArray, Rows
+from rdstitch.choices import LensName, ModelName
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rigid_in_plane
 from rdstitch.geometry.radial_homography import from_plane, to_plane
@@ -148,12 +149,12 @@ class Alignment:
     used: NDArray[np.bool_]
     components: tuple[tuple[int, ...], ...]
     reference: int
-    model: str
+    model: ModelName
     model_reason: str
     rms: float
     links: tuple[LinkFit, ...]
     relief: ReliefTest
-    lens: str = "division"
+    lens: LensName = "division"
     lens_reason: str = "one parameter"
     poses: PlanarPoses | None = None
     tilt_spread: float = 0.0

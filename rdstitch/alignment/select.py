@@ -24,7 +24,7 @@ from rdstitch.alignment.noise import evidence_of
 from rdstitch.alignment.pairwise import fit_pairwise
 from rdstitch.alignment.starts import fit_model
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.choices import Purpose
+from rdstitch.choices import ModelName, Purpose
 from rdstitch.robust.posterior import TWENTY_TO_ONE, Evidence
 
 _MIN_RATIO = 3.0
@@ -122,7 +122,7 @@ class Posterior:
 
 
 def select_model(
-    problem: Problem, names: Sequence[str], lenses: Sequence[BoolArray] = (), purpose: Purpose = Purpose.MOSAIC
+    problem: Problem, names: Sequence[ModelName], lenses: Sequence[BoolArray] = (), purpose: Purpose = Purpose.MOSAIC
 ) -> ModelChoice:
     """Adjust hypotheses from the least to the most free, and take the one with the best score.
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray, IntArray, as_numbers
-from rdstitch.choices import SolverName
+from rdstitch.choices import FocalSource, SolverName
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography, are_homographies
@@ -96,7 +96,7 @@ def estimate_radial_homography(
     *,
     image_size2: tuple[int, int] | None = None,
     focal: float | None = None,
-    focal_source: str | None = None,
+    focal_source: FocalSource | None = None,
     center: tuple[float, float] | None = None,
     solver: SolverName = "auto",
     tilt: ArrayLike | None = None,
@@ -119,7 +119,7 @@ def estimate_radial_homography(
         Of image 2, where it differs: the same lens at another resolution or turned by a quarter.
     focal : float, optional
         Focal length, pixels of image 1; guessed if not given. Models of planar motion use it.
-    focal_source : str, optional
+    focal_source : FocalSource, optional
         How much the focal length can be trusted, a key of :data:`rdstitch.geometry.camera.FOCAL_LOG_STD`;
         "option" if not given.
     center : (float, float), optional

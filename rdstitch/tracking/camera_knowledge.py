@@ -11,6 +11,7 @@ from rdstitch.alignment import Alignment, AlignmentOptions
 from rdstitch.alignment.given_checks import judged_focal
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import ModelName
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.delays import DELAY_STD, at_delay, change_with_delay
 from rdstitch.matching.distortion_consensus import vote
@@ -30,7 +31,7 @@ class CameraKnowledge:
 
     given: AlignmentOptions
     pair: EstimationOptions  # with λ, once it is known
-    model: str  # of the motion
+    model: ModelName  # of the motion
     distortion: float  # NaN, inf: not known
     distortion_std: float
     length_std: float = math.nan  # of all lengths, relative
@@ -104,7 +105,7 @@ class CameraKnowledge:
 
     def cameras_for(self, keyframes: Sequence[Frame], focal_std: float | None) -> list[Camera]:
         """Those of keyframes that are aligned, with the focal length of the map if it is to be kept so closely."""
-        cameras = [keyframe.camera.with_focal() for keyframe in keyframes]
+        cameras = [keyframe.camera.with_guessed_focal() for keyframe in keyframes]
         if self.pair.distortion is not None and not self.given.lens_known:
             cameras = [camera.with_coefficients(self.pair.distortion) for camera in cameras]
         if self.focal is None or focal_std is None:

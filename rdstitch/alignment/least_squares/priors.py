@@ -12,6 +12,7 @@ import numpy as np
 from rdstitch.alignment.least_squares.plane_marks import ControlPoints, PlaneMarks
 from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, X, Y
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.choices import FocalSource
 from rdstitch.geometry.camera import LENS_PARAMETERS
 from rdstitch.robust.posterior import LENS, TILT, Prior, exact, focal_prior
 
@@ -47,7 +48,7 @@ class CameraPriors:
 
     log_focal: float  # log_focal, log_focal_std: of the logarithm of the focal length in half diagonals
     log_focal_std: float
-    focal_source: str  # where it comes from, a key of FOCAL_LOG_STD
+    focal_source: FocalSource
     tilt: tuple[float, float]  # (ψ, θ), radians
     tilt_known: bool
     # (N, 2): how the tilt of each image differs from the shared one, radians; zeros where that is not known

@@ -17,10 +17,11 @@ from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentR
 from rdstitch.alignment.noise import Coherence, coherence, evidence_of
 from rdstitch.alignment.pairwise import pairwise_homographies
 from rdstitch.arrays import BoolArray
+from rdstitch.choices import LensName
 from rdstitch.geometry.camera import LENS_PARAMETERS
 from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, prior_costs
 
-LENSES: dict[str, tuple[str, ...]] = {
+LENSES: dict[LensName, tuple[str, ...]] = {
     "division": ("distortion",),
     "division-center": ("distortion", "center_x", "center_y"),
     "division2": ("distortion", "distortion2", "center_x", "center_y"),
@@ -56,7 +57,7 @@ class LensEvidence(Enum):
 class LensChoice:
     """The lens chosen."""
 
-    name: str  # a key of LENSES
+    name: LensName  # a key of LENSES
     free: BoolArray  # (5,): its parameters among LENS_PARAMETERS
     pairwise: BundleAdjustmentResult  # every link on its own with this lens
     reason: str  # one sentence
@@ -64,6 +65,13 @@ class LensChoice:
     # motion that is less regular. That μ is needed only pairs can say: it could stand for relief
     refinements: tuple[BoolArray, ...] = ()
     evidence: LensEvidence = LensEvidence.SUFFICIENT
+
+    @classmethod
+    def held(
+        cls, pairwise: BundleAdjustmentResult, reason: str, evidence: LensEvidence = LensEvidence.SUFFICIENT
+    ) -> Self:
+        """The lens as it was before: given, or not observable."""
+        return cls("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), pairwise, reason, evidence=evidence)
 
     @property
     def observable(self) -> bool:
@@ -79,18 +87,13 @@ class LensChoice:
         return replace(self, name=name, free=free, reason=f"{name}: {more}")
 
 
-def free_parameters(name: str) -> BoolArray:
+def free_parameters(name: LensName) -> BoolArray:
     """Which of :data:`rdstitch.geometry.camera.LENS_PARAMETERS` a lens of the ladder has, shape (5,)."""
     return np.array([parameter in LENSES[name] for parameter in LENS_PARAMETERS])
 
 
-def choose_lens(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Sequence[str]) -> LensChoice:
-    """Choose among lenses, keys of :data:`LENSES` from the simplest; none where the lens is given.
-
-    ``pairwise`` is every link on its own with a homography, and λ free unless the lens is given.
-    """
-    if not names:
-        return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), pairwise, "given")
+def choose_lens(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Sequence[LensName]) -> LensChoice:
+    """Choose among lenses, from the simplest; ``pairwise`` is every link on its own with a homography, and λ free."""
     observations, images = links.observations, links.observations.image_count
     if len(names) > 1 and len(observations) > _ENOUGH_LINKS:
         return _choose_by_some(links, pairwise, names)
@@ -119,7 +122,7 @@ def choose_lens(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Seq
     return LensChoice(names[best], free[best], fits[best], reason, refinements)
 
 
-def _choose_by_some(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Sequence[str]) -> LensChoice:
+def _choose_by_some(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Sequence[LensName]) -> LensChoice:
     """The lens that evenly chosen links show, and every link on its own with it."""
     simplest = free_parameters("division")
     some = np.arange(0, len(links.observations), -(-len(links.observations) // _ENOUGH_LINKS))

@@ -1,7 +1,6 @@
 """Whether the images show λ at all, or depth that looks like it; and then, which lens it is."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -28,7 +27,7 @@ published sets, and for 12 to 18 times of what fisheyes of matches leave beside 
 def choose_observable_lens(
     task: GivenImages, sample: Observations, relations: Sequence[RadialHomography], priors: CameraPriors
 ) -> LensChoice:
-    """Of every link with a homography of its own: whether λ is seen, or could be depth, and which lens it is."""
+    """Whether links with a homography of their own show λ, or what could be depth; and which lens they show."""
 
     def links_at(lens: FloatArray, free: BoolArray) -> LinkProblem:
         return LinkProblem(sample, relations_at(sample, relations, lens), lens, free, priors)
@@ -38,7 +37,7 @@ def choose_observable_lens(
     given = np.array([*task.cameras[0].coefficients, 0.0, 0.0])
     if options.lens_known:
         links = links_at(given, none)
-        return choose_lens(links, pairwise_homographies(links), ())
+        return LensChoice.held(pairwise_homographies(links), "given")
     votes = vote([k.relation.distortion for k in task.links], [k.relation.distortion_std for k in task.links])
     links = links_at(np.where(first, np.nan_to_num(votes.distortion), 0.0), first)
     pairwise = pairwise_homographies(links)
@@ -46,9 +45,8 @@ def choose_observable_lens(
     if sample.image_count <= _FEW_VIEWS or not moving:
         with_given_lens = pairwise_homographies(links_at(given, none))
         if not moving or _is_depth(pairwise, with_given_lens):
-            choice = choose_lens(links, with_given_lens, ())
             missing = LensEvidence.DEPTH if moving else LensEvidence.LITTLE_MOTION
-            return replace(choice, reason="λ is not observable", evidence=missing)
+            return LensChoice.held(with_given_lens, "λ is not observable", missing)
     return choose_lens(links, pairwise, options.lenses)
 
 

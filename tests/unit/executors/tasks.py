@@ -58,6 +58,10 @@ class OnlyIn:
         return only_in, (self.process, bytes(300_000))
 
 
+def content_of(loaded: OnlyIn) -> int:
+    return loaded.process
+
+
 def only_here() -> OnlyIn:
     return OnlyIn(os.getpid())
 

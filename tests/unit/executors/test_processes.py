@@ -67,7 +67,7 @@ def test_what_a_task_raises_is_raised_with_its_type() -> None:
 def test_what_cannot_be_loaded_costs_its_task_only() -> None:
     with ProcessExecutor(1) as executor:
         with pytest.raises(AttributeError, match="cannot be loaded"):
-            executor.submit(tasks.square, tasks.OnlyIn(os.getpid())).result(10.0)
+            executor.submit(tasks.content_of, tasks.OnlyIn(os.getpid())).result(10.0)
         assert executor.submit(tasks.square, 3).result(10.0) == 9
         with pytest.raises(AttributeError, match="cannot be loaded"):
             executor.submit(tasks.only_here).result(10.0)
