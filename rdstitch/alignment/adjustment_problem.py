@@ -47,7 +47,7 @@ class Fit:
 
     @property
     def overdispersion(self) -> float:
-        """Of the errors that it leaves, at least that of the problem; see :class:`BundleAdjuster`."""
+        """Overdispersion of the errors that it leaves, at least that of the problem; see :class:`BundleAdjuster`."""
         return self.adjusted.adjuster.overdispersion
 
     @property
@@ -75,7 +75,7 @@ class LinkProblem:
     camera_priors: CameraPriors
 
     def at(self, adjusted: BundleAdjustmentResult, free_lens: BoolArray) -> Self:
-        """The same from where an adjustment has put links and lens, with so much of the lens free."""
+        """The problem from where an adjustment has put links and lens, with so much of the lens free."""
         lens = adjusted.parameters.lens
         return replace(self, homographies=adjusted.homographies, lens=lens, free_lens=free_lens)
 
@@ -170,12 +170,12 @@ class Problem(LinkProblem):
         return self.observations.sigma(squared)
 
     def extend(self, fit: Fit, lens: BoolArray) -> Fit:
-        """The same model with more of the lens free."""
+        """Fit the same model with more of the lens free."""
         wider = replace(self, free_lens=self.free_lens | lens)
         return wider.refine(fit.model, fit.adjusted.parameters, fit.tilt_spread)
 
     def adjuster_of(self, fit: Fit) -> BundleAdjuster:
-        """Of a fit, with the priors on it."""
+        """The adjuster of a fit, with the priors on it."""
         return self.adjuster(fit.model, fit.tilt_spread, fit.adjusted.parameters.shared, fit.overdispersion)
 
     def adjuster(
@@ -185,7 +185,7 @@ class Problem(LinkProblem):
         shared: FloatArray | None = None,
         overdispersion: float | None = None,
     ) -> BundleAdjuster:
-        """Of one model, with the priors on it; those of tilts as they show with the ``shared`` parameters."""
+        """The adjuster of one model with its priors; those of tilts as they show with the ``shared`` parameters."""
         tilt_spread = _TILT_SPREAD_START if tilt_spread is None else tilt_spread
         references = [self.reference] if self.camera_priors.fix_frame else []
         freedom = FreeParameters.fixing(model, self.count, references, self.free_lens)

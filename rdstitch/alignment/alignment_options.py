@@ -71,7 +71,7 @@ class AlignmentOptions:
         return [(psi, theta) for psi, theta in (attitudes + self.tilt).tolist()]
 
     def camera_priors(self, cameras: Sequence[Camera]) -> CameraPriors:
-        """As the adjustment needs it."""
+        """What is given of the cameras, as priors of the adjustment."""
         count = len(cameras)
         attitudes = _of_images("attitudes", self.attitudes, (count, 2), missing=0.0)
         delayed = self.delayed_attitudes

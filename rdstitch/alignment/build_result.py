@@ -93,7 +93,7 @@ class AdjustedImages:
 
     @cached_property
     def errors(self) -> FloatArray:
-        """Of all correspondences (M, 2), pixels, whitened: how far points are off, whatever moved them."""
+        """Errors of all correspondences (M, 2), pixels, whitened: how far points are off, whatever moved them."""
         observations, adjusted = replace(self.problem.observations, relief=None), self.fit.adjusted
         return whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
 

@@ -163,7 +163,7 @@ class _ShownTilts:
 
     @classmethod
     def of(cls, problem: Problem, fit: Fit, options: AlignmentOptions) -> "_ShownTilts":
-        """By a planar fit that knows nothing of the tilts; up to what all have in common where no tilt is given."""
+        """Take the tilts from a planar fit that knows nothing of them; up to what all share where no tilt is given."""
         adjuster, adjusted, model = problem.adjuster_of(fit), fit.adjusted, fit.model
         normal = adjuster.normal_equations(adjusted)
         tilts = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)[:, [PSI, THETA]]
@@ -185,7 +185,7 @@ class _ShownTilts:
         return cls(images, tilts[images], np.maximum(variances, 0.0), axes)
 
     def log_likelihood(self, expected: FloatArray, scatter: float) -> float:
-        """Of tilts (N, 2) that scatter by so much, radians, about those of the images."""
+        """Log-likelihood of tilts (N, 2) that scatter by so much, radians, about those of the images."""
         error = self.axes.T @ (self.tilts - expected[self.images]).ravel()
         variance = self.variances + scatter**2 + _EXACT**2
         return -0.5 * float((error**2 / variance + np.log(variance)).sum())
@@ -197,7 +197,7 @@ class _ShownTilts:
         return values[best], float(_SCATTERS[best])
 
     def delay(self, expected: FloatArray) -> tuple[float, float] | None:
-        """By how many seconds the times of tilts (N, S, 2) at :data:`DELAYS` are late, with its std, or None."""
+        """Delay of the times of tilts (N, S, 2) at :data:`DELAYS`, s, with its standard deviation; or None."""
         slow = smooth(expected)
         scores = (
             np.array([self.best_scatter(slow[:, k])[0] for k in range(len(DELAYS))]) - (DELAYS / DELAY_STD) ** 2 / 2

@@ -28,7 +28,7 @@ class KnownModel:
 
     @classmethod
     def of(cls, draft: AdjustedImages) -> Self | None:
-        """That of a draft; None over relief, whose heights are found for each set of links."""
+        """The model of a draft; None over relief, whose heights are found for each set of links."""
         fit = draft.fit
         if draft.choice.over_relief:
             return None

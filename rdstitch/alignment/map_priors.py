@@ -55,7 +55,7 @@ class MapFit:
     leverage: Mapping[int | str, float] = field(default_factory=dict)  # by image of the problem, and name of a point
 
     def leverage_of(self, images: IntArray) -> dict[int | str, float]:
-        """The same by what those of the problem are among all images (N,)."""
+        """The leverage by the numbers that images of the problem have among all images (N,)."""
         return {key if isinstance(key, str) else int(images[key]): value for key, value in self.leverage.items()}
 
 
@@ -90,7 +90,7 @@ class _KnownPlaces(ABC):
 
     @abstractmethod
     def prior(self, priors: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
-        """With priors on the places: their means (N, 2) and inverse variances (N,)."""
+        """Priors with those on the places: their means (N, 2) and inverse variances (N,)."""
 
     @abstractmethod
     def jacobians(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:

@@ -48,7 +48,7 @@ class OdometryFit:
 
     @classmethod
     def of(cls, motions: Sequence[Motion]) -> "OdometryFit | None":
-        """From motions between frames; None where they are too few, or none goes anywhere."""
+        """Fit motions between frames; None where they are too few, or none goes anywhere."""
         if len(motions) < _MIN_STEPS:
             return None
         body, camera, turn, variance = (np.array(column) for column in zip(*motions, strict=True))

@@ -76,7 +76,7 @@ def pairwise_homographies(links: LinkProblem) -> BundleAdjustmentResult:
 
 
 def best_trial(links: LinkProblem, model: MotionModel) -> tuple[BundleAdjuster, Parameters]:
-    """Of a few links on their own, from the shared parameters that come nearest to them without adjustment."""
+    """The adjuster of a few links on their own, from the shared parameters nearest to them without adjustment."""
     priors, few = links.camera_priors, evenly_spaced(len(links.observations), _TRIAL_LINKS)
     sample = links.observations.subset(few).thinned(_TRIAL_MATCHES)
     trial = LinkProblem(sample, links.homographies[few], links.lens, links.free_lens, priors)

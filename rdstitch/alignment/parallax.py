@@ -18,7 +18,7 @@ _ASIDE = 0.3  # half diagonals from the middle of an image, where its size on th
 
 @dataclass(frozen=True)
 class Parallax:
-    """Of the images of an adjustment, by this adjuster or one with other weights."""
+    """Parallax of the images of an adjustment, by this adjuster or one with other weights."""
 
     adjuster: BundleAdjuster
     adjusted: BundleAdjustmentResult
@@ -46,7 +46,7 @@ class Parallax:
 
     @cached_property
     def size(self) -> float:
-        """Of half a diagonal of most images on the plane, or between directions."""
+        """Size of half a diagonal of most images on the plane, or between directions."""
         return float(np.median(self._sizes))
 
     def from_middle(self, place: FloatArray) -> FloatArray:
@@ -75,7 +75,7 @@ class Parallax:
 
     @cached_property
     def _sizes(self) -> FloatArray:
-        """Of half a diagonal of each image on the plane, or between directions, (N,)."""
+        """Sizes (N,) of half a diagonal of each image on the plane, or between directions."""
         aside = [self._places(self._back @ np.array([x, y, 1.0])) for x, y in ((_ASIDE, 0.0), (0.0, _ASIDE))]
         away = [np.linalg.norm(places - self._centres, axis=1) / _ASIDE for places in aside]
         sizes: FloatArray = np.maximum((away[0] + away[1]) / 2.0, 1e-12)
@@ -92,11 +92,11 @@ class Parallax:
 
     @cached_property
     def _shifts(self) -> FloatArray:
-        """Of the camera away from where it turns, one an image, (N, 2): any, since nothing is known of them."""
+        """Shifts (N, 2) of the camera away from where it turns, one an image: any, since nothing is known of them."""
         return np.random.default_rng(0).normal(size=(len(self._back), 2))
 
     def _moved(self, place: FloatArray, images: IntArray) -> FloatArray:
-        """By how much measured points (m, 2) of places move in their images (m,) with the height of the ground."""
+        """Motion (m, 2) of measured points of places in their images (m,) with the height of the ground."""
         if self.is_turn:
             shift: FloatArray = self._shifts[images]
             return shift

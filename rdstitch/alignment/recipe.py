@@ -242,7 +242,7 @@ def _matches_of_a_link(links: int, options: AlignmentOptions) -> int:
 def _observations(
     links: Sequence[Link], cameras: Sequence[Camera], max_matches: int
 ) -> tuple[Observations, list[RadialHomography]]:
-    """Of each link at most so many correspondences, chosen before any is turned round; and how each maps them."""
+    """At most so many correspondences of each link, chosen before any is turned round; and how each maps them."""
     read = in_alternate_directions([link.thinned(max_matches) for link in links])
     return Observations.from_links(read, cameras), [link.relation for link in read]
 

@@ -52,7 +52,7 @@ class ReliefField:
         return np.concatenate(poses, axis=-1), np.concatenate(shared, axis=-1)
 
     def _steps_by_waves(self, agreement: float) -> tuple[FloatArray, FloatArray]:
-        """By relief as steep as leaves the agreement of errors that was found, px²."""
+        """Steps by relief as steep as leaves the agreement of errors that was found, px²."""
         step = _WAVES // _BANDS
         responses = [self._response_to(self._waves(start, step), 2 * step) for start in range(0, _WAVES, step)]
         left = float(np.mean([left for left, *_ in responses]))
@@ -61,7 +61,7 @@ class ReliefField:
         return poses * scale, shared * scale
 
     def _steps_by_curvature(self) -> tuple[FloatArray, FloatArray]:
-        """By a plane that is curved alike everywhere, as a wall may be: what pairs absorb of it does not cancel out.
+        """Steps by a plane that is curved alike everywhere, as a wall may be: what pairs absorb of it does not cancel.
 
         How much curvature there is shows what they do not absorb of it, beyond noise; of one pair next to nothing.
         """
@@ -177,7 +177,7 @@ def _independent(part: LinearizedErrors) -> FloatArray:
 
 
 def _wave_vectors(in_space: bool) -> FloatArray:
-    """Of :data:`_WAVES` waves, (W, 2 or 3), in all directions; wavelengths are spread evenly in their logarithm."""
+    """Vectors of :data:`_WAVES` waves (W, 2 or 3) in all directions; wavelengths are even in their logarithm."""
     number = np.arange(_WAVES)
     length = _SHORTEST * (_LONGEST / _SHORTEST) ** ((number + 0.5) / _WAVES)
     # Directions by an additive recurrence, which is even at all lengths (Roberts 2018).

@@ -169,7 +169,7 @@ class _TurnTrial:
 def _with_planar(
     posterior: Posterior, tried: Sequence[Hypothesis], models: Sequence[MotionModel], *, free: bool
 ) -> list[Hypothesis]:
-    """With planar models, from the least to the most free, which are ``free`` homographies or not."""
+    """Try planar models, from the least to the most free, which are ``free`` homographies or not."""
     tried = list(tried)
     for model in models:
         if posterior.problem.count == 2 and model.free_tilts and free:

@@ -43,7 +43,7 @@ def start_from(problem: Problem, model: MotionModel, other: Fit) -> Parameters:
 
 
 def _tree(problem: Problem) -> SpanningTree:
-    """Of the links trusted most, from the reference."""
+    """The spanning tree of the links trusted most, from the reference."""
     o = problem.observations
     return spanning_tree(problem.count, o.image1, o.image2, problem.trust, problem.reference)
 

@@ -102,7 +102,7 @@ def _relief(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> Relie
 
 
 def _influence(response: LinearResponse) -> tuple[FloatArray, FloatArray]:
-    """By how much each correspondence moves the shared parameters (M, S'), and their covariance by the priors alone."""
+    """Influence of each correspondence on the shared parameters (M, S'), and their covariance by the priors alone."""
     normal = response.normal
     count = len(normal.gradient_shared)
     poses, shared = normal.responses(np.zeros_like(normal.coupling), -np.eye(count))

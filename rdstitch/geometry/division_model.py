@@ -224,7 +224,7 @@ def _distorted_radius(radius: FloatArray, distortion: float, higher: tuple[float
 
 
 def _guarded_radius(radius: FloatArray, distortion: float, higher: tuple[float, ...]) -> FloatArray:
-    """The same (N,) where there is a solution, by Newton's method with bisection."""
+    """Undistorted radii (N,) where there is a solution, by Newton's method with bisection."""
     limit = valid_radius(distortion, higher)
     with np.errstate(over="ignore", invalid="ignore"):
         low, high = np.zeros_like(radius), np.full_like(radius, limit)

@@ -44,7 +44,7 @@ class HeldOut:
 
     @classmethod
     def of(cls, residual: FloatArray) -> "HeldOut":
-        """From residuals (M, D)."""
+        """Percentiles of residuals (M, D)."""
         length = np.linalg.norm(residual, axis=1)
         return cls(float(np.median(length)), float(np.percentile(length, 95)))
 
@@ -184,7 +184,7 @@ def _seam_residual(residual: FloatArray) -> float:
 
 
 def _long_edges(edges: Callable[[list[int]], Iterable[FloatArray]], cameras: Sequence[Camera]) -> dict[int, FloatArray]:
-    """Those of some images that are long enough to be seen to be straight."""
+    """Edges of some images that are long enough to be seen to be straight."""
     chosen = evenly_spaced(len(cameras), _MAX_IMAGES).tolist()
     return {
         k: ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > _EDGE * 2.0 * cameras[k].scale]

@@ -91,7 +91,7 @@ class Reweighting:
         self._scale = 0.0 if known else float(np.percentile(np.linalg.norm(matches.residual, axis=1), _WIDEST))
 
     def weights(self, left: FloatArray) -> FloatArray | None:
-        """Of matches (M,) by what is left of them (M, D); None after the last round."""
+        """Weights (M,) of matches by their residuals (M, D); None after the last round."""
         if self._sharp == _SHARP_ROUNDS:
             return None
         length = np.linalg.norm(left, axis=1)
@@ -161,12 +161,12 @@ def factorized(matrix: Any) -> Any:
 
 
 def interpolation(nodes: NDArray[np.intp], shares: FloatArray, count: int) -> "sparse.csr_array":
-    """From values at ``count`` nodes to those at places between four of them (N, 4), which have these shares."""
+    """Matrix from values at ``count`` nodes to those at places between four of them (N, 4), weighted so."""
     return sparse.csr_array((shares.ravel(), nodes.ravel(), np.arange(0, nodes.size + 1, 4)), shape=(len(nodes), count))
 
 
 def _coarser(shapes: Shapes, cameras: Sequence[Camera], cells: int) -> "sparse.csr_array | None":
-    """From values at the nodes of grids of half as many cells to those of all images; None where these are few."""
+    """Matrix from the nodes of grids of half as many cells to those of all images; None where these are few."""
     if cells < _MIN_HALVED or _first_nodes(shapes)[-1] <= _FACTORIZED:
         return None
     parts = {}

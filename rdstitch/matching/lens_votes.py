@@ -70,7 +70,7 @@ class LensVotes:
         return np.asarray(np.linalg.norm(whitened, axis=1))
 
     def lens_index(self, second: BoolArray) -> IntArray:
-        """From which lens, 0 or 1, the two images of each pair come, shape (L, 2)."""
+        """The lens, 0 or 1, that each of the two images of each pair comes from, shape (L, 2)."""
         return np.stack([second[self.image1], second[self.image2]], axis=1).astype(np.intp)
 
     def fitted(self, lens_index: IntArray, lenses: FloatArray) -> FloatArray:

@@ -113,7 +113,7 @@ def _divisions(count: int, votes: LensVotes) -> Iterator[tuple[BoolArray, FloatA
 
 
 def _margins(count: int, votes: LensVotes, second: BoolArray, lenses: FloatArray) -> FloatArray:
-    """By how much more the votes were missed if an image came from the other lens, for each image (N,)."""
+    """How much more the votes were missed if each image (N,) came from the other lens."""
     lens_index = votes.lens_index(second)
     missed = votes.mahalanobis_residuals(lenses[lens_index])
     total: FloatArray = np.zeros(count)

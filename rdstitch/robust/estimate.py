@@ -70,7 +70,7 @@ class PairMatches:
 
     @property
     def focal_prior(self) -> Prior:
-        """On the logarithm of the focal length."""
+        """Prior on the logarithm of the focal length."""
         return focal_prior(math.log(self.focal), self.camera1.focal_log_std, self.camera1.focal_source or "guess")
 
     @property
@@ -80,7 +80,7 @@ class PairMatches:
 
     @property
     def sizes(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """Of both images, pixels."""
+        """Width and height of both images, pixels."""
         return self.camera1.image_size, self.camera2.image_size
 
     @property
@@ -175,7 +175,7 @@ def estimate_radial_homography(
 
 
 def estimate_radial_homographies(pairs: Sequence[PairMatches], options: EstimationOptions) -> list[RadialHomography]:
-    """As :func:`estimate_radial_homography`, of many pairs at once: several times faster, the same result for each."""
+    """Estimate many pairs at once: several times faster than :func:`estimate_radial_homography`, and the same."""
     if options.solver == "two_point" and any(pair.tilts is None for pair in pairs):
         raise ArgumentError("the two_point solver needs the tilt")
     result: dict[int, RadialHomography] = {}
@@ -195,7 +195,7 @@ def estimate_radial_homographies(pairs: Sequence[PairMatches], options: Estimati
 
 
 def _estimate_batch(pairs: list[PairMatches], options: EstimationOptions) -> list[RadialHomography]:
-    """Of pairs with the same ``batch_key``."""
+    """Estimate pairs with the same ``batch_key``."""
     order = [pair.order for pair in pairs]
     data = Measurements.of_pairs(
         [(pair.points1[ranked], pair.points2[ranked]) for pair, ranked in zip(pairs, order, strict=True)],
@@ -243,7 +243,7 @@ def _selected(
 
 
 def _tilts(tilt: ArrayLike | None) -> FloatArray | None:
-    """Of both images."""
+    """Tilts of both images of each pair; None where none is known."""
     if tilt is None:
         return None
     angles = as_numbers("tilt", tilt)

@@ -57,7 +57,7 @@ class Problems(Protocol[Equations]):
         ...
 
     def normal_equations(self, parameters: FloatArray) -> Equations:
-        """At parameters (B, K)."""
+        """Normal equations at parameters (B, K)."""
         ...
 
     def cost(self, before: Equations, after: Equations) -> FloatArray:

@@ -158,7 +158,7 @@ class PlanarPairModel:
         return np.asarray(state + step @ self._directions)
 
     def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of the focal length, where it is free: its cost (B,), and the slope and curvature by a step (B, P)."""
+        """Prior of a free focal length: its cost (B,), and the slope and curvature by a step (B, P)."""
         slope, curvature = np.zeros((2, len(state), len(self.parameters)))
         if self.focal_prior is None or self.tilts_known:
             return slope[:, 0], slope, curvature

@@ -34,7 +34,7 @@ _GOLDEN = 0.618034  # its multiples are spread evenly, whatever their number
 
 @dataclass(eq=False)
 class Hypotheses(Rows):
-    """For each of B pairs a homography with λ, and how well it explains the matches."""
+    """A homography with λ for each of B pairs, and how well it explains the matches."""
 
     homography: FloatArray  # (B, 3, 3): in the half-diagonal frame
     distortion: FloatArray  # (B,)
@@ -173,7 +173,7 @@ class _SolverState:
             best.put(rows[worthwhile][better], optimized.take(better))
 
     def _best_of(self, rows: IntArray, picks: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of each pair the hypothesis that explains a part of its matches best: H, λ and cost; inf where none is."""
+        """The hypothesis of each pair that explains a part of its matches best: H, λ and cost; inf where none is."""
         _, batch, size = picks.shape
         chosen = picks.reshape(len(rows), 1, -1)
         x1, x2 = (

@@ -118,7 +118,7 @@ class PairProblems:
         return np.where(possible[:, None], moved, parameters), possible
 
     def covariances(self, parameters: FloatArray, equations: PairEquations) -> FloatArray:
-        """Of the parameters where they stand, (B, P, P)."""
+        """Covariances (B, P, P) of the parameters at their present values."""
         of_matches = influence(equations.transferred, self.data.present, equations.scale, self.free > 0)
         jacobian = self.jacobian(parameters)
         return covariances(equations.information, of_matches, jacobian, equations.noise, self.data)

@@ -85,7 +85,7 @@ class BundleAdjustmentResult:
 
     @cached_property
     def matrices(self) -> ModelMatrices:
-        """Of the images."""
+        """Homographies of the images, with their derivatives."""
         return self.adjuster.model.matrices(self.parameters.poses, self.parameters.shared)
 
     @cached_property
@@ -95,12 +95,12 @@ class BundleAdjustmentResult:
 
     @cached_property
     def errors(self) -> FloatArray:
-        """Of each correspondence (M, 2), pixels, whitened; NaN where it cannot be transferred."""
+        """Errors of the correspondences (M, 2), pixels, whitened; NaN where one cannot be transferred."""
         return whitened_errors(self.adjuster.observations, self.homographies, self.parameters.lens)
 
     @property
     def bare(self) -> Self:
-        """The same without errors and matrices, which take more memory than the rest; they can be computed again."""
+        """The result without errors and matrices, which take more memory than the rest; they can be computed again."""
         return replace(self)
 
     @property
@@ -120,7 +120,7 @@ class BundleAdjustmentResult:
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Of the model's named parameters and the free ones of the lens (S', S'), priors included."""
+        """Covariance (S', S') of the model's named parameters and the free ones of the lens, priors included."""
         return self.adjuster.covariance(self)
 
 
@@ -200,12 +200,12 @@ class BundleAdjuster:
         return squared_lengths(whitened_errors(self.observations, self._homographies(parameters), parameters.lens))
 
     def normal_equations(self, adjusted: BundleAdjustmentResult, width: float | None = None) -> SparseNormalEquations:
-        """At a solution, priors included; the ``width`` of the loss, pixels, follows the errors if not given."""
+        """Normal equations at a solution, with priors; ``width`` of the loss, pixels, by the errors if not given."""
         state = self.linearized(adjusted.parameters, width or ALIGNMENT_WIDTH * adjusted.sigma)
         return self._normal_equations(state, adjusted.sigma)
 
     def covariance(self, adjusted: BundleAdjustmentResult) -> FloatArray:
-        """Of the named parameters and the free ones of the lens (S', S'), as far as the overdispersion is right."""
+        """Covariance (S', S') of the named and the free lens parameters, as far as the overdispersion is right."""
         derivative = self.named_parameters(adjusted.parameters.shared)[1]
         covariance = inverse_information(self.normal_equations(adjusted).shared_information())
         named: FloatArray = derivative @ covariance @ derivative.T
@@ -253,7 +253,7 @@ class BundleAdjuster:
         return _State(parameters, matrices, homographies, equations)
 
     def _cost(self, parameters: Parameters, errors: FloatArray, sigma: float, width: float) -> float:
-        """Of errors (M, 2) at some parameters, with the priors."""
+        """Cost of errors (M, 2) at some parameters, with the priors."""
         lost = float(robust_cost(squared_lengths(errors), width).sum())
         return lost * self.weight(sigma) + self._prior_cost(parameters)
 
@@ -274,7 +274,7 @@ class BundleAdjuster:
         return min(of_most_links, WIDEST_START * float(np.median(self.observations.scale2)))
 
     def weight(self, sigma: float) -> float:
-        """Of squared errors of this scatter: one over their variance, as far as they are independent."""
+        """Weight of squared errors of this scatter: one over their variance, as far as they are independent."""
         return 1.0 / (sigma**2 * self.overdispersion)
 
     def camera_prior_cost(self, parameters: Parameters) -> float:
@@ -294,7 +294,7 @@ class BundleAdjuster:
         return known + marks.cost(matrices, parameters.lens, self.model.focal(parameters.shared))
 
     def _normal_equations(self, state: _State, sigma: float) -> SparseNormalEquations:
-        """Of the data at ``state``, and of the priors."""
+        """Normal equations of the data at ``state``, and of the priors."""
         normal = assemble(
             state.equations,
             self.observations,

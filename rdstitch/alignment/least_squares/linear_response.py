@@ -33,7 +33,7 @@ class LinearResponse:
 
     @classmethod
     def of(cls, adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> Self:
-        """At the solution."""
+        """The response at a solution."""
         width = ALIGNMENT_WIDTH * adjusted.sigma
         weight = robust_weight(adjusted.squared, width)
         curvature = float(np.clip(robust_slope(adjusted.squared, width).sum() / max(weight.sum(), 1e-300), 0.1, 1.0))
@@ -71,7 +71,7 @@ class LinearResponse:
         return self.normal.responses(of_poses, of_shared)
 
     def changes(self, part: LinearizedErrors, poses: FloatArray, shared: FloatArray) -> FloatArray:
-        """By how much the errors change, (m, 2, C), with steps of poses (N, D, C) and shared parameters (S, C)."""
+        """Changes of the errors (m, 2, C) with steps of poses (N, D, C) and shared parameters (S, C)."""
         o, columns = self.adjuster.observations, shared.shape[1]
         change, derivative = np.empty((*part.errors.shape, columns)), self._derivative(part)
         for link in range(part.first, part.last):
@@ -81,7 +81,7 @@ class LinearResponse:
         return change
 
     def _derivative(self, part: LinearizedErrors) -> FloatArray:
-        """Of some links' homographies and the free lens by their own parameters, see :func:`link_derivatives`."""
+        """Derivatives of some links' homographies and the free lens, see :func:`link_derivatives`."""
         adjusted, links = self.adjusted, slice(part.first, part.last)
         lens_count = int(self.adjuster.free.lens.sum())
         return link_derivatives(self.adjuster.observations, adjusted.matrices, adjusted.homographies, lens_count, links)

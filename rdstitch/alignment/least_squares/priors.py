@@ -32,7 +32,7 @@ class Priors:
 
     @cached_property
     def camera(self) -> tuple[Prior, ...]:
-        """Of the named parameters and the lens."""
+        """Priors of the named parameters and the lens."""
         return self.shared + self.lens
 
     @classmethod
@@ -66,7 +66,7 @@ class CameraPriors:
     delayed_attitudes: FloatArray | None = None  # (N, S, 2): the attitudes, if their times are late by DELAYS
 
     def priors(self, model: MotionModel, count: int, tilt_spread: float, log_focal: float | None = None) -> Priors:
-        """For ``count`` images whose tilts scatter by ``tilt_spread`` where nothing else is known of them.
+        """Priors for ``count`` images whose tilts scatter by ``tilt_spread`` where nothing else is known of them.
 
         Tilts are turned into what they do in the images with ``log_focal``, the prior one if not given.
         """
@@ -86,13 +86,13 @@ class CameraPriors:
         return replace(known, poses=poses, poses_precision=precision, marks=self.marks)
 
     def with_lens(self, distortion: float) -> Self:
-        """With a focal length that was guessed no longer than that of a fisheye with this λ, in half diagonals."""
+        """Shorten a guessed focal length to that of a fisheye with this λ, in half diagonals."""
         if self.focal_source != "guess" or distortion >= 0.0:
             return self
         return replace(self, log_focal=min(self.log_focal, math.log(_MOST_BARREL / -distortion) / 2.0))
 
     def of_camera(self, model: MotionModel, count: int) -> Priors:
-        """For ``count`` images, nothing on their poses."""
+        """Priors for ``count`` images, with none on their poses."""
         tilts = map(exact, self.tilt) if self.tilt_known else (TILT, TILT)
         focal_length = focal_prior(self.log_focal, self.log_focal_std, self.focal_source)
         of_name = dict(zip(("psi", "theta", "log_focal"), (*tilts, focal_length), strict=True))
@@ -100,7 +100,7 @@ class CameraPriors:
         return Priors(tuple(of_name[name] for name in model.shared_names), LENS, poses, poses)
 
     def of(self, images: IntArray) -> "CameraPriors":
-        """Of some of the images only."""
+        """The priors of some of the images only."""
         return replace(
             self,
             attitudes=self.attitudes[images],

@@ -79,7 +79,7 @@ class LensChoice:
         return self.evidence is LensEvidence.SUFFICIENT
 
     def refined(self, free: BoolArray) -> Self:
-        """With the parameters that were freed in the end."""
+        """The choice with the parameters that were freed in the end."""
         if (free == self.free).all():
             return self
         name = next(name for name in LENSES if not (free & ~free_parameters(name)).any())

@@ -114,7 +114,7 @@ class PlanarModel(MotionModel):
     def poses_from(
         self, other: MotionModel, poses: FloatArray, shared: FloatArray, attitudes: FloatArray
     ) -> FloatArray:
-        """Those of another planar model only change their units."""
+        """See the base class; poses of another planar model only change their units."""
         if not isinstance(other, PlanarModel):
             return super().poses_from(other, poses, shared, attitudes)
         result = poses.copy()
