@@ -19,7 +19,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.places import contradicting_places
 from rdstitch.inputs.delays import DELAYS
 from rdstitch.matching.links import Link
-from rdstitch.robust.posterior import known_focal
+from rdstitch.robust.priors import known_focal
 
 FEWEST_MATCHES = 5
 """Of a link: through four points goes a homography, whichever they are."""

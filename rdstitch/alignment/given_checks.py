@@ -30,7 +30,7 @@ from rdstitch.choices import ModelName
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.delays import DELAY_STD, DELAYS, at_delay, smooth
 from rdstitch.results.messages import Message
-from rdstitch.robust.posterior import WRONG_GIVEN_FOCAL
+from rdstitch.robust.priors import WRONG_GIVEN_FOCAL
 
 _MAX_IMAGES = 60  # that are compared: evenly chosen ones of more say as well which signs are right
 _LOG_ODDS = math.log(1000.0)  # by how much the images must contradict what the user says

@@ -14,7 +14,7 @@ from rdstitch.alignment.result import Alignment, PlanarPoses
 from rdstitch.alignment.uncertainty import pose_jacobian
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
-from rdstitch.robust.posterior import exact
+from rdstitch.robust.priors import exact
 
 
 def without_measurements(near_copies: Mapping[int, int], options: AlignmentOptions) -> dict[int, int]:

@@ -31,7 +31,8 @@ from rdstitch.alignment.starts import fit_model
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.choices import Purpose
 from rdstitch.robust.covariance import enlarged
-from rdstitch.robust.posterior import LENS, MODEL_ERROR
+from rdstitch.robust.posterior import MODEL_ERROR
+from rdstitch.robust.priors import LENS_PRIORS
 
 _ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 20
 """Matches in all, and of each link at least, that say how high and how wide the hills are."""
@@ -187,7 +188,7 @@ def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, ove
     """
     free = fit_model(problem, HOMOGRAPHY)
     posterior = Posterior(problem, Purpose.TRAJECTORY)
-    against = float(np.clip((posterior.scored(free).score - posterior.scored(fit).score) / 2.0, -50.0, 50.0))
+    against = float(np.clip((posterior.hypothesis(free).cost - posterior.hypothesis(fit).cost) / 2.0, -50.0, 50.0))
     of_free = 1.0 / (1.0 + math.exp(against))
     off = free.adjusted.parameters.lens - fit.adjusted.parameters.lens
     other = considered_covariance(problem, free, covariances(problem, free)[1], over_relief=over_relief)
@@ -203,7 +204,7 @@ def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:
     """
     if problem.free_lens.sum() != 1:
         return fit
-    parameters, prior = fit.adjusted.parameters, LENS[0]
+    parameters, prior = fit.adjusted.parameters, LENS_PRIORS[0]
     value = float(parameters.lens[0])
     # What the images say without the prior, which has had its part in the adjustment: the value and its variance.
     total = 1.0 / float(problem.adjuster_of(fit).covariance(fit.adjusted)[-1, -1])

@@ -18,7 +18,7 @@ from rdstitch.robust.measurements import Measurements, checked_matches, padded_l
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import ModelSelection, PairFit, StartedPairs, rms_of
 from rdstitch.robust.pair_models import PlanarPairModel
-from rdstitch.robust.posterior import Prior, focal_prior, known_focal
+from rdstitch.robust.priors import Prior, focal_prior, known_focal
 from rdstitch.robust.ransac import Hypotheses, ransac
 
 _NOT_IN_AUTO = "four_point"  # finds what three points find, from more samples
@@ -287,7 +287,7 @@ def _result(
         parameters=("distortion", *fit.model.parameters),
         distortion_std=fit.distortion_std,
         model=fit.model.name,
-        motion=fit.model.motion(fit.state) if isinstance(fit.model, PlanarPairModel) else None,
+        motion=fit.model.motion(fit.state),
         rms=float(rms_of(errors[None], threshold)[0]),
         solver=solver,
         iterations=iterations,

@@ -205,11 +205,11 @@ class _SolverState:
         The choice of the model refines the best of them again.
         """
         wide = 3.0 * self.options.threshold
-        if isinstance(self.solver.model, HomographyPairModel):
-            return self._refined(start, data, rows, self.solver.model, wide)
-        best = start
+        free, best = HomographyPairModel(), start
+        if self.solver.model == free:
+            return self._refined(start, data, rows, free, wide)
         enough = start.inliers.sum(axis=1) >= _FREE_REFINEMENT
-        for chosen, model in ((enough, HomographyPairModel()), (~enough, self.solver.model)):
+        for chosen, model in ((enough, free), (~enough, self.solver.model)):
             part = np.flatnonzero(chosen)
             if len(part):
                 refined = self._refined(best.take(part), data.take(part), rows[part], model, wide)

@@ -13,7 +13,7 @@ from rdstitch.robust.linearization import PairLenses, TransferDerivatives, diffe
 from rdstitch.robust.loss import loss_width, noise_of, robust_cost
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
-from rdstitch.robust.posterior import Prior, prior_costs, prior_slopes
+from rdstitch.robust.priors import Prior, prior_costs, prior_slopes
 
 _STATE = 9  # numbers of a state of any pair model; before these, parameters have those of the lens
 

@@ -26,7 +26,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.levenberg_marquardt import MAX_DAMPING, damping_by_gain
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
-from rdstitch.robust.posterior import prior_costs, prior_slopes
+from rdstitch.robust.priors import prior_costs, prior_slopes
 
 MIN_GAIN = 1e-5
 """Expected relative fall of the loss that is worth another step: a hundredth of the noise."""

@@ -1,5 +1,5 @@
 """Priors on all that an alignment adjusts, by what is given of the camera; those of the world are of
-:mod:`rdstitch.robust.posterior`.
+:mod:`rdstitch.robust.priors`.
 """
 
 import math
@@ -14,7 +14,7 @@ from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, X, Y
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.choices import FocalSource
 from rdstitch.geometry.camera import LENS_PARAMETERS
-from rdstitch.robust.posterior import LENS, TILT, Prior, exact, focal_prior
+from rdstitch.robust.priors import LENS_PRIORS, TILT_PRIOR, Prior, exact, focal_prior
 
 _MOST_BARREL = 0.375
 """-λ of an equisolid fisheye with the focal length as the unit; that of a stereographic one is 1/4."""
@@ -93,11 +93,11 @@ class CameraPriors:
 
     def of_camera(self, model: MotionModel, count: int) -> Priors:
         """Priors for ``count`` images, with none on their poses."""
-        tilts = map(exact, self.tilt) if self.tilt_known else (TILT, TILT)
+        tilts = map(exact, self.tilt) if self.tilt_known else (TILT_PRIOR, TILT_PRIOR)
         focal_length = focal_prior(self.log_focal, self.log_focal_std, self.focal_source)
         of_name = dict(zip(("psi", "theta", "log_focal"), (*tilts, focal_length), strict=True))
         poses = np.zeros((count, model.pose_size))
-        return Priors(tuple(of_name[name] for name in model.shared_names), LENS, poses, poses)
+        return Priors(tuple(of_name[name] for name in model.shared_names), LENS_PRIORS, poses, poses)
 
     def of(self, images: IntArray) -> "CameraPriors":
         """The priors of some of the images only."""

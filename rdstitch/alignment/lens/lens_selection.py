@@ -19,7 +19,8 @@ from rdstitch.alignment.pairwise import pairwise_homographies
 from rdstitch.arrays import BoolArray
 from rdstitch.choices import LensName
 from rdstitch.geometry.camera import LENS_PARAMETERS
-from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, prior_costs
+from rdstitch.robust.posterior import Evidence
+from rdstitch.robust.priors import LENS_PRIORS, TWENTY_TO_ONE, prior_costs
 
 LENSES: dict[LensName, tuple[str, ...]] = {
     "division": ("distortion",),
@@ -113,7 +114,7 @@ def choose_lens(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Seq
         fits.append(pairwise_homographies(links.at(fits[-1], free[index])))
         evidence = evidence_of(observations, fits[-1].errors)
         rarer = 0.0 if names[best] == "division2" else TWENTY_TO_ONE  # a series that was cut off has a next term
-        if _score(evidence, fits[index]) + rarer < _score(evidence, fits[best]):
+        if _cost(evidence, fits[index]) + rarer < _cost(evidence, fits[best]):
             best = index
     reason = _reason(names, fits, best)
     if few:
@@ -154,10 +155,10 @@ def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     return replace(problem, free_lens=finer), problem.extend(fit, finer)
 
 
-def _score(evidence: Evidence, fit: BundleAdjustmentResult) -> float:
+def _cost(evidence: Evidence, fit: BundleAdjustmentResult) -> float:
     """-2 log of the posterior of a lens, up to a constant."""
     parameters = int(fit.adjuster.free.lens.sum())
-    return float(evidence.score(fit.errors, parameters, prior_costs(LENS, fit.parameters.lens).sum())[0])
+    return float(evidence.cost(fit.errors, parameters, prior_costs(LENS_PRIORS, fit.parameters.lens).sum())[0])
 
 
 def _reason(names: Sequence[str], fits: Sequence[BundleAdjustmentResult], best: int) -> str:

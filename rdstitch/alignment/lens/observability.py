@@ -16,7 +16,7 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.division_model import OBSERVABLE_STD
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.distortion_consensus import vote
-from rdstitch.robust.posterior import LENS
+from rdstitch.robust.priors import LENS_PRIORS
 
 _FEW_VIEWS, _LENS_OVER_DEPTH = 3, 6.0
 """Images from more than which depth does not look like a lens; times by which a lens must make what neighbours share
@@ -32,7 +32,7 @@ def choose_observable_lens(
     def links_at(lens: FloatArray, free: BoolArray) -> LinkProblem:
         return LinkProblem(sample, relations_at(sample, relations, lens), lens, free, priors)
 
-    options, first, none = task.options, np.arange(len(LENS)) == 0, np.zeros(len(LENS), dtype=np.bool_)
+    options, first, none = task.options, np.arange(len(LENS_PRIORS)) == 0, np.zeros(len(LENS_PRIORS), dtype=np.bool_)
     # The images' points are already relative to the centre of the camera.
     given = np.array([*task.cameras[0].coefficients, 0.0, 0.0])
     if options.lens_known:
@@ -65,5 +65,5 @@ def _observable(pairwise: BundleAdjustmentResult) -> bool:
     """Whether one homography a pair leaves λ well determined."""
     distortion = float(pairwise.parameters.lens[0])
     # Without what the prior says.
-    information = 1.0 / float(pairwise.covariance[0, 0]) - LENS[0].curvature(distortion)
+    information = 1.0 / float(pairwise.covariance[0, 0]) - LENS_PRIORS[0].curvature(distortion)
     return bool(information > OBSERVABLE_STD**-2.0)

@@ -20,7 +20,7 @@ from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import ModelName
 from rdstitch.geometry.radial_homography import inverses, project
-from rdstitch.robust.posterior import Prior
+from rdstitch.robust.priors import Prior
 
 LENS = np.array([True, True, False, False, False])
 

@@ -18,7 +18,7 @@ from rdstitch.alignment.uncertainty import sandwich_covariances
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.geometry.radial_homography import project
-from rdstitch.robust.posterior import Prior
+from rdstitch.robust.priors import Prior
 
 LENS, NOISE = Camera((640, 480), distortion=-0.2), 0.4
 KNOWN = (Prior(), Prior(), Prior(((1.0, float(np.log(1.3)), 0.01),)))
