@@ -37,23 +37,23 @@ class Fit:
     """One model adjusted to a problem."""
 
     model: MotionModel
-    adjusted: BundleAdjustmentResult
+    result: BundleAdjustmentResult
     tilt_spread: float | None = None  # standard deviation of the images' own tilts, radians; None without such
 
     @property
     def free_lens(self) -> BoolArray:
         """Lens parameters that were estimated, (5,)."""
-        return self.adjusted.adjuster.free.lens
+        return self.result.adjuster.free.lens
 
     @property
     def overdispersion(self) -> float:
         """Overdispersion of the errors that it leaves, at least that of the problem; see :class:`BundleAdjuster`."""
-        return self.adjusted.adjuster.overdispersion
+        return self.result.adjuster.overdispersion
 
     @property
     def bare(self) -> Self:
         """See :attr:`BundleAdjustmentResult.bare`."""
-        return replace(self, adjusted=self.adjusted.bare)
+        return replace(self, result=self.result.bare)
 
 
 @dataclass(frozen=True)
@@ -172,11 +172,11 @@ class Problem(LinkProblem):
     def extend(self, fit: Fit, lens: BoolArray) -> Fit:
         """Fit the same model with more of the lens free."""
         wider = replace(self, free_lens=self.free_lens | lens)
-        return wider.refine(fit.model, fit.adjusted.parameters, fit.tilt_spread)
+        return wider.refine(fit.model, fit.result.parameters, fit.tilt_spread)
 
     def adjuster_of(self, fit: Fit) -> BundleAdjuster:
         """The adjuster of a fit, with the priors on it."""
-        return self.adjuster(fit.model, fit.tilt_spread, fit.adjusted.parameters.shared, fit.overdispersion)
+        return self.adjuster(fit.model, fit.tilt_spread, fit.result.parameters.shared, fit.overdispersion)
 
     def adjuster(
         self,

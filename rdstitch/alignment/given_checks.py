@@ -120,7 +120,7 @@ def is_strained(priors: CameraPriors, fit: Fit) -> bool:
     """Whether a focal length that the user gave gave way to the images by more than is likely."""
     if priors.focal_source not in ("option", "file") or not fit.model.has_metric_poses:
         return False
-    moved = float(fit.adjusted.parameters.shared[-1]) - priors.log_focal
+    moved = float(fit.result.parameters.shared[-1]) - priors.log_focal
     return abs(moved) > _STRAINED * priors.log_focal_std
 
 
@@ -129,7 +129,7 @@ def check_focal(given: Camera, fit: Fit, covariance: FloatArray | None) -> Messa
     if not fit.model.has_metric_poses or covariance is None or given.focal is None:
         return None
     place = fit.model.shared_names.index("log_focal")
-    focal, std = fit.model.focal(fit.adjusted.parameters.shared) * given.scale, math.sqrt(covariance[place, place])
+    focal, std = fit.model.focal(fit.result.parameters.shared) * given.scale, math.sqrt(covariance[place, place])
     _, contradicted = judged_focal(given.focal_log_std, math.log(focal / given.focal), std)
     return focal_contradicted(given.focal, focal, std) if contradicted else None
 
@@ -164,7 +164,7 @@ class _ShownTilts:
     @classmethod
     def of(cls, problem: Problem, fit: Fit, options: AlignmentOptions) -> "_ShownTilts":
         """Take the tilts from a planar fit that knows nothing of them; up to what all share where no tilt is given."""
-        adjuster, adjusted, model = problem.adjuster_of(fit), fit.adjusted, fit.model
+        adjuster, adjusted, model = problem.adjuster_of(fit), fit.result, fit.model
         normal = adjuster.normal_equations(adjusted)
         tilts = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)[:, [PSI, THETA]]
         images = evenly_spaced(problem.count, _MAX_IMAGES)

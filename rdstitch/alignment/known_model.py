@@ -32,7 +32,7 @@ class KnownModel:
         fit = draft.fit
         if draft.choice.over_relief:
             return None
-        reference, parameters = int(draft.images[draft.problem.reference]), fit.adjusted.parameters
+        reference, parameters = int(draft.images[draft.problem.reference]), fit.result.parameters
         others = draft.choice.others
         return cls(fit.model.name, draft.images, reference, parameters, fit.free_lens, fit.tilt_spread, others)
 

@@ -128,7 +128,7 @@ class _Positions(_KnownPlaces):
         self.labels, self.item = np.flatnonzero(self.known).tolist(), np.arange(len(self.metres))
 
     def estimated(self, fit: Fit) -> ComplexArray:
-        places: ComplexArray = fit.adjusted.parameters.poses[self.known][:, [X, Y]] @ _COMPLEX
+        places: ComplexArray = fit.result.parameters.poses[self.known][:, [X, Y]] @ _COMPLEX
         return places
 
     def prior(self, priors: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
@@ -174,17 +174,17 @@ class _Control(_KnownPlaces):
         return replace(priors, marks=PlaneMarks(shown.image, shown.points, target[shown.point], shared))
 
     def jacobians(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
-        parameters, marks = fit.adjusted.parameters, adjuster.priors.marks
+        parameters, marks = fit.result.parameters, adjuster.priors.marks
         assert marks is not None
         focal = fit.model.focal(parameters.shared)
-        derivative = marks.equations(fit.adjusted.matrices, parameters.lens, adjuster.free.lens, focal)[1]
+        derivative = marks.equations(fit.result.matrices, parameters.lens, adjuster.free.lens, focal)[1]
         return marks.image, derivative, marks.precision
 
 
 def _sightings(control: ControlPoints, fit: Fit) -> FloatArray:
     """Where a fit has each sighting of control points, (M, 2); not finite where no place looks like that."""
     adjusted, marks = (
-        fit.adjusted,
+        fit.result,
         PlaneMarks(control.image, control.points, control.points, np.zeros(len(control.image))),
     )
     focal = fit.model.focal(adjusted.parameters.shared)
@@ -201,14 +201,14 @@ def _adjusted(problem: Problem, fit: Fit, known: list[_KnownPlaces]) -> MapFit:
             priors, similarity, excess = places.prior_from_map(priors, refined)
             on_map.append((similarity, excess))
         with_map = replace(problem, camera_priors=priors)
-        refined = with_map.refine(fit.model, refined.adjusted.parameters, fit.tilt_spread)
+        refined = with_map.refine(fit.model, refined.result.parameters, fit.tilt_spread)
         moved = [
             np.abs(places.estimated(refined) - former).max() * abs(similarity.scale) / (np.median(places.std) * excess)
             for places, former, (similarity, excess) in zip(known, before, on_map, strict=True)
         ]
         if max(moved) < _SETTLED:
             break
-    growth = math.hypot(refined.adjusted.sigma, MODEL_ERROR) / math.hypot(fit.adjusted.sigma, MODEL_ERROR)
+    growth = math.hypot(refined.result.sigma, MODEL_ERROR) / math.hypot(fit.result.sigma, MODEL_ERROR)
     distance = float(np.median(on_map[0][0].residuals))
     far = isinstance(known[0], _Positions) and distance > OUTLYING * max(float(np.median(known[0].std)), POSITION_STD)
     if far or growth > _MAX_GROWTH:
@@ -220,7 +220,7 @@ def _adjusted(problem: Problem, fit: Fit, known: list[_KnownPlaces]) -> MapFit:
 def _leverage(problem: Problem, fit: Fit, known: Sequence[_KnownPlaces]) -> dict[int | str, float]:
     """How far (0 to 1) what is known puts itself where the fit has it; by the label of each."""
     adjuster = problem.adjuster_of(fit)
-    normal, (count, size) = adjuster.normal_equations(fit.adjusted), adjuster.free.poses.shape
+    normal, (count, size) = adjuster.normal_equations(fit.result), adjuster.free.poses.shape
     leverage: dict[int | str, float] = {}
     for places in known:
         image, derivative, precision = places.jacobians(adjuster, fit)

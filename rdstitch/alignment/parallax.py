@@ -21,7 +21,7 @@ class Parallax:
     """Parallax of the images of an adjustment, by this adjuster or one with other weights."""
 
     adjuster: BundleAdjuster
-    adjusted: BundleAdjustmentResult
+    result: BundleAdjustmentResult
 
     @np.errstate(all="ignore")  # what lies beyond a horizon has no place
     def of(self, part: LinearizedErrors) -> tuple[FloatArray, FloatArray]:
@@ -29,7 +29,7 @@ class Parallax:
 
         The unit does not matter, since how high the ground is shows in the errors.
         """
-        o, lens = self.adjuster.observations, self.adjusted.parameters.lens
+        o, lens = self.adjuster.observations, self.result.parameters.lens
         link = o.link[part.rows]
         distortion, higher, centre = split_lens(lens)
         flat = undistort(o.points1[part.rows] - centre, distortion, higher)
@@ -59,7 +59,7 @@ class Parallax:
     @cached_property
     def _back(self) -> FloatArray:
         """Image-to-plane homographies, or those to directions, (N, 3, 3)."""
-        return inverses(self.adjusted.matrices.matrices)
+        return inverses(self.result.matrices.matrices)
 
     def _places(self, lifted: FloatArray) -> FloatArray:
         """Places (m, 2) on the plane, or directions (m, 3), of homogeneous ones (m, 3)."""
@@ -84,7 +84,7 @@ class Parallax:
     @cached_property
     def _nadirs(self) -> tuple[FloatArray, FloatArray]:
         """What each camera is above (N, 2), and how high it is (N,); roughly, in some unit, without poses."""
-        model, parameters = self.adjuster.model, self.adjusted.parameters
+        model, parameters = self.adjuster.model, self.result.parameters
         if not model.has_metric_poses:
             return self._centres, self._sizes
         poses = model.metric_poses(parameters.poses, parameters.shared)
@@ -100,7 +100,7 @@ class Parallax:
         if self.is_turn:
             shift: FloatArray = self._shifts[images]
             return shift
-        lens, matrices = self.adjusted.parameters.lens, self.adjusted.matrices.matrices[images]
+        lens, matrices = self.result.parameters.lens, self.result.matrices.matrices[images]
         distortion, higher, _ = split_lens(lens)
         nadirs, heights = self._nadirs
         away = (place - nadirs[images]) / heights[images, None]

@@ -198,9 +198,9 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
 
 def from_another_start(problem: Problem, fit: Fit) -> Fit:
     """A fit that converged as it is; another one from where the links lead, where that converges or fits better."""
-    if fit.adjusted.converged:
+    if fit.result.converged:
         return fit
-    return min((fit, fit_model(problem, fit.model)), key=lambda one: (not one.adjusted.converged, one.adjusted.sigma))
+    return min((fit, fit_model(problem, fit.model)), key=lambda one: (not one.result.converged, one.result.sigma))
 
 
 def _with_checked_focal(adjusted: AdjustedImages, stated: AlignmentOptions) -> Alignment:
@@ -278,7 +278,7 @@ def _drop_wrong_pairs(
     as_given, all_links = all_links.free_lens, replace(all_links, free_lens=choice.fit.free_lens)
     o = all_links.observations
     for _ in range(_ROUNDS):
-        adjusted, model = choice.fit.adjusted, choice.fit.model
+        adjusted, model = choice.fit.result, choice.fit.model
         between_images, _ = all_links.part(np.ones_like(wrong), images)
         inside = np.isin(o.image1, images) & np.isin(o.image2, images)
         squared = between_images.adjuster(model).squared(adjusted.parameters)

@@ -141,12 +141,12 @@ class ReliefField:
 
     @cached_property
     def _parallax(self) -> Parallax:
-        return Parallax(self.response.adjuster, self.response.adjusted)
+        return Parallax(self.response.adjuster, self.response.result)
 
     @cached_property
     def _pairs(self) -> IntArray:
         """Inliers and neighbours of theirs in the same link, (2, P), by the first of each pair."""
-        pairs = neighbours(self.response.adjuster.observations, self.response.adjusted.inliers)
+        pairs = neighbours(self.response.adjuster.observations, self.response.result.inliers)
         nearest: IntArray = np.unique(np.sort(np.stack(pairs), axis=0), axis=1)
         return nearest
 

@@ -46,7 +46,7 @@ def choose_over_relief(
     Freeing the distortion centre is not tried: over relief it bends the whole as the ground bends the images.
     """
     # Where neighbours hardly agree, errors along the parallax are none of the ground: blobs have them, seen obliquely.
-    if not shows_relief(residual_coherence(choice.fit.adjusted)) or weighted_by_relief(problem, choice.fit) is None:
+    if not shows_relief(residual_coherence(choice.fit.result)) or weighted_by_relief(problem, choice.fit) is None:
         return choice
     problem = replace(problem, overdispersion=choice.fit.overdispersion)
     fits: list[Fit] = []
@@ -78,7 +78,7 @@ def weighted_by_relief(problem: Problem, fit: Fit) -> Problem | None:
     if not fit.model.has_metric_poses or problem.count < _MIN_IMAGES:
         return None
     plain = replace(problem, observations=replace(problem.observations, relief=None))
-    adjuster, adjusted, o = plain.adjuster_of(fit), fit.adjusted, plain.observations
+    adjuster, adjusted, o = plain.adjuster_of(fit), fit.result, plain.observations
     field = Parallax(adjuster, adjusted)
     errors, parallax, moved = (np.zeros_like(o.points1) for _ in range(3))
     for part in linearized_errors(o, adjusted.homographies, adjusted.parameters.lens, adjuster.free.lens):
@@ -107,7 +107,7 @@ def _settled(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
 
 
 def _refined(problem: Problem, fit: Fit) -> Fit:
-    return problem.refine(fit.model, fit.adjusted.parameters, fit.tilt_spread)
+    return problem.refine(fit.model, fit.result.parameters, fit.tilt_spread)
 
 
 def _scatter(errors: FloatArray, parallax: FloatArray, effective: float) -> float:

@@ -51,7 +51,7 @@ class ModelChoice:
     @property
     def reason(self) -> str:
         """One sentence."""
-        model, adjusted = self.fit.model, self.fit.adjusted
+        model, adjusted = self.fit.model, self.fit.result
         described = model.description(adjusted.parameters.poses, adjusted.parameters.shared)
         return f"{model.name}: {described}; most matches fit to {adjusted.sigma:.2f} pixels{self.others}"
 
@@ -101,12 +101,12 @@ class Posterior:
     def hypothesis(self, fit: Fit) -> Hypothesis:
         """The hypothesis of a fit."""
         # Of any model what its errors show, whatever its freedom costs: it is held against what seams can hide.
-        field = float(self.evidence.field(fit.adjusted.errors)[0])
+        field = float(self.evidence.field(fit.result.errors)[0])
         layout = stretch(fit) if self.purpose.picture else 1.0
         spread = (fit.tilt_spread or 0.0) / _TYPICAL_TILT_SPREAD
         wide = 4.0 * self.problem.count * math.log(max(spread, 1.0))
-        priors = self.problem.adjuster_of(fit).camera_prior_cost(fit.adjusted.parameters)
-        cost = self.lower_bound(fit.model, fit.adjusted.errors, fit.free_lens) + wide + priors
+        priors = self.problem.adjuster_of(fit).camera_prior_cost(fit.result.parameters)
+        cost = self.lower_bound(fit.model, fit.result.errors, fit.free_lens) + wide + priors
         return Hypothesis(fit, cost, field, layout)
 
     def lower_bound(self, model: MotionModel, errors: FloatArray, free_lens: BoolArray | None = None) -> float:
@@ -201,7 +201,7 @@ def _with_wider_lenses(
             fit = tried[index].fit
             wider = posterior.hypothesis(posterior.problem.extend(fit, lens | fit.free_lens))
             # A centre that is off bends a plane as rough ground bends the images; directions it does not bend.
-            shown = fit.model.on_sphere or residual_coherence(wider.fit.adjusted).correlation < NO_COHERENCE
+            shown = fit.model.on_sphere or residual_coherence(wider.fit.result).correlation < NO_COHERENCE
             if wider.cost < tried[index].cost and shown:
                 tried[index] = wider
     return tried
@@ -246,7 +246,7 @@ def _choice(tried: Sequence[Hypothesis], best: Hypothesis, *, requested: bool) -
     if requested:
         return ModelChoice(best.fit, "; as requested")
     listed = [
-        f"{one.fit.model.name} {one.fit.adjusted.sigma:.2f} pixels"
+        f"{one.fit.model.name} {one.fit.result.sigma:.2f} pixels"
         + (", an impossible layout" if one.implausible else f", {one.cost - best.cost:+.0f}")
         for one in tried
         if one is not best

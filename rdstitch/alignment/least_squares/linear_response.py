@@ -26,7 +26,7 @@ class LinearResponse:
     """An adjustment, linearized at its solution."""
 
     adjuster: BundleAdjuster
-    adjusted: BundleAdjustmentResult  # of this adjuster, or of one that held a part of the lens
+    result: BundleAdjustmentResult  # of this adjuster, or of one that held a part of the lens
     weight: FloatArray  # (M,): what the square of each error counts in the normal equations
     curvature: float  # mean derivative of ``w r`` by r, in units of the mean of w: between 0 and 1
     normal: SparseNormalEquations  # with the curvature in them
@@ -42,7 +42,7 @@ class LinearResponse:
 
     def parts(self) -> Iterator[LinearizedErrors]:
         """The errors with their derivatives, some links at a time."""
-        adjusted = self.adjusted
+        adjusted = self.result
         return linearized_errors(
             self.adjuster.observations, adjusted.homographies, adjusted.parameters.lens, self.adjuster.free.lens
         )
@@ -82,6 +82,6 @@ class LinearResponse:
 
     def _derivative(self, part: LinearizedErrors) -> FloatArray:
         """Derivatives of some links' homographies and the free lens, see :func:`link_derivatives`."""
-        adjusted, links = self.adjusted, slice(part.first, part.last)
+        adjusted, links = self.result, slice(part.first, part.last)
         lens_count = int(self.adjuster.free.lens.sum())
         return link_derivatives(self.adjuster.observations, adjusted.matrices, adjusted.homographies, lens_count, links)

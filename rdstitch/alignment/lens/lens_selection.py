@@ -150,7 +150,7 @@ def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     finer = free_parameters("division3")
     if problem.count < ENOUGH_IMAGES or (fit.free_lens != free_parameters("division2")).any():
         return problem, fit
-    if residual_coherence(fit.adjusted).correlation >= NO_COHERENCE:
+    if residual_coherence(fit.result).correlation >= NO_COHERENCE:
         return problem, fit
     return replace(problem, free_lens=finer), problem.extend(fit, finer)
 
