@@ -28,7 +28,8 @@ POSE_TILT_SPREAD = math.radians(35.0)
 
 _TILT_SPREAD_START = math.radians(3.0)
 _MIN_TILT_SPREAD = math.radians(0.05)
-_ROUNDS, _SETTLED = 3, 0.1  # of estimating scales of priors, and by how much they still change at the end
+_ROUNDS = 3  # rounds of estimating the scales of priors
+_SETTLED = 0.1  # relative change of a scale that is none
 _MISFIT = 1.5  # times the errors of links on their own from which on those of a model are its own
 
 

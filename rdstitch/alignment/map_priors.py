@@ -30,13 +30,12 @@ from rdstitch.robust.similarity_fit import OUTLYING, SimilarityFit, fit_similari
 POSITION_STD = 3.0
 """Metres: of one coordinate of a position by a receiver without corrections, within one flight."""
 
-_MIN_POSITIONS, _MIN_CONTROL, _MIN_SPREAD = 4, 3, 5.0
-"""Positions, and points, and standard deviations that they must be spread over, to say anything of the shape."""
-
+_MIN_POSITIONS = 4  # positions that say anything of the shape
+_MIN_CONTROL = 3  # control points that do
+_MIN_SPREAD = 5.0  # standard deviations of one that they must be spread over
 _CLICK = 0.5  # pixels: of a coordinate of where an image shows a control point
-_ROUNDS, _SETTLED = 8, 0.1
-"""Of fitting the similarity and adjusting again; standard deviations by which what is known still moves at the end."""
-
+_ROUNDS = 8  # rounds of fitting the similarity and adjusting again
+_SETTLED = 0.1  # standard deviations by which what is known still moves at the end
 _MAX_GROWTH = 1.1  # times by which the errors of the images may grow
 _SURE = 1.0 - 1e-6  # leverage beyond which rounding counts
 _MANY = 50  # positions whose leverage is computed; that of others is taken to be the median

@@ -33,14 +33,10 @@ from rdstitch.matching.links import Link, in_alternate_directions
 from rdstitch.results.messages import Message
 from rdstitch.robust.chance import occupied_cells
 
-# Side of an image, beside that of the largest, below which it was reduced, and must not set the scale of the output.
-_REDUCED = 0.8
-_MATCHES_OF_A_TURN = 5000
-"""Correspondences of all links together that the final adjustment of a turn on the spot uses at least, if there are."""
-
-_MATCHES_OF_ALL, _MATCHES_OF_A_LINK = 500_000, 40
-"""Correspondences of all links together that are enough, and of a link that are used nevertheless."""
-
+_REDUCED = 0.8  # side over that of the largest image, below which one was reduced and must not set the output's scale
+_MATCHES_OF_A_TURN = 5000  # correspondences of all links that the final adjustment of a pure rotation uses at least
+_MATCHES_OF_ALL = 500_000  # correspondences of all links together that are enough
+_MATCHES_OF_A_LINK = 40  # correspondences of a link that are used nevertheless
 _MATCHES_FOR_SELECTION = 5_000  # correspondences of all links together that a model is chosen by
 # Half diagonals. Matches at random leave 0.2 (eight of them) to 0.8, whichever model is adjusted to them (72 times).
 _MAX_RMS = 0.1

@@ -19,9 +19,8 @@ from rdstitch.alignment.noise import neighbours
 from rdstitch.alignment.parallax import Parallax
 from rdstitch.arrays import FloatArray, IntArray
 
-_SHORTEST, _LONGEST = 0.5, 6.0
-"""Wavelengths, in half diagonals of an image on the ground: what neighbours show, and what poses absorb whole."""
-
+_SHORTEST = 0.5  # half diagonals of an image on the ground: the shortest wavelength that neighbours show
+_LONGEST = 6.0  # the same: a wavelength that poses absorb whole
 _WAVES = 32  # waves, each as a sine and a cosine
 _BANDS = 4  # of waves that are answered together
 
@@ -30,8 +29,8 @@ _NOISE_FIELDS = 16
 
 _CURVATURES = 3  # of a plane: along x, aslant, and along y
 
-_UNSEEN, _NEWTON_STEPS = 1e-9, 50
-"""Share of the largest information that none is; steps to the variance of curvatures at most."""
+_UNSEEN = 1e-9  # information, over the largest, that is none
+_NEWTON_STEPS = 50  # steps to the variance of curvatures at most
 
 
 @dataclass(frozen=True)

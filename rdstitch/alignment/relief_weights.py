@@ -26,13 +26,13 @@ from rdstitch.robust.loss import NORMAL_MEDIAN
 
 _MIN_IMAGES = 3  # images: of two, tilts do what heights do, and the errors do not show which
 
-_ROUNDS, _SETTLED = 4, 0.02
-"""Of finding the scatter of the heights and adjusting again, and by how much it still changes at the end: at first the
-camera has followed the hills, so that it is found too small."""
+_ROUNDS = 4
+"""Rounds of finding the scatter of the heights and adjusting again: at first the camera has followed the hills, so that
+it is found too small."""
 
-_SQUARE_MEDIAN, _MEDIAN_STD = NORMAL_MEDIAN**2, 2.333
-"""Median of the square of a normal variable of variance 1; the standard deviation of the median of N such squares, in
-medians and times the root of N."""
+_SETTLED = 0.02  # relative change of that scatter that is none
+_SQUARE_MEDIAN = NORMAL_MEDIAN**2  # median of the square of a normal variable of variance 1
+_MEDIAN_STD = 2.333  # standard deviation of the median of N such squares, in medians and times the root of N
 
 _SIGNIFICANT = 3.0
 """Standard deviations of the logarithm of their ratio by which errors along the parallax must exceed those across."""

@@ -34,9 +34,8 @@ from rdstitch.robust.covariance import enlarged
 from rdstitch.robust.posterior import MODEL_ERROR
 from rdstitch.robust.priors import LENS_PRIORS
 
-_ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 20
-"""Matches in all, and of each link at least, that say how high and how wide the hills are."""
-
+_ENOUGH = 6000  # matches in all that say how high and how wide the hills are
+_MIN_MATCHES_PER_LINK = 20  # matches of each link at least
 _UNLIKELY_FOCAL = 4.0
 """Standard deviations of what is known of a focal length beyond which it may stand for something else."""
 

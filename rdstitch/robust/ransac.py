@@ -20,7 +20,8 @@ from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.solvers.solutions import Solutions
 
 # Halved or doubled, none of these changes what is found, only the time.
-_FIRST_BATCH, _MAX_BATCH = 48, 512  # samples a turn; every turn has twice as many as the one before
+_FIRST_BATCH = 48  # samples of the first round; every round has twice as many as the one before
+_MAX_BATCH = 512  # samples of a round at the most
 _ALONE = 512  # samples up to which the solver that assumes least goes on alone if it needs no more
 _SAMPLES_AT_ONCE = 4096
 _MIN_EXPLORATION = 96  # samples that every solver draws unless its own confidence is reached before

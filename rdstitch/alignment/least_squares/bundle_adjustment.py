@@ -31,9 +31,8 @@ from rdstitch.robust.priors import prior_costs, prior_slopes
 MIN_GAIN = 1e-5
 """Expected relative fall of the loss that is worth another step: a hundredth of the noise."""
 
-FEW_GAIN, LOOSE_GAIN = 1e-4, 1e-3
-"""The same of a few matches of each pair; and where another descent goes on from there."""
-
+FEW_GAIN = 1e-4  # the same of a few matches of each pair
+LOOSE_GAIN = 1e-3  # the same where another descent goes on from there
 WIDEST_START = 0.05
 """Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is down-weighted."""
 
@@ -145,11 +144,10 @@ class _Descent:
     converged: bool
 
 
-_STEPS, _LAST_STEPS = 4, 12  # linearizations at one width of the loss, and at the last one
-
-_NARROWING, _NARROW = 3.0, 1.05
-"""By how much the loss narrows from one width to the next; widths of the last one up to which it is that."""
-
+_STEPS = 4  # linearizations at one width of the loss
+_LAST_STEPS = 12  # linearizations at the last width
+_NARROWING = 3.0  # factor by which the loss narrows from one width to the next
+_NARROW = 1.05  # last widths up to which a width is the last one
 _SETTLED = 0.02  # relative change of the errors' standard deviation that is none
 
 _FIRST_DAMPING = 1e-6

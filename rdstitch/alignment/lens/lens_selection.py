@@ -36,10 +36,11 @@ CENTER = np.array([name.startswith("center") for name in LENS_PARAMETERS])
 NO_COHERENCE = 0.3
 """Correlation of the errors of neighbours up to which nothing else can be to blame: relief leaves more."""
 
-ENOUGH_IMAGES, _ENOUGH_IMAGES_OF_A_MOTION = 4, 3
-"""Images from which on the distortion centre is freed: where every link is on its own, and where one camera explains
-all of them. In fewer a tilt and a change of height stand for it, and pairs like those of ``examples.paper figure5`` are
-registered worse with it free."""
+ENOUGH_IMAGES = 4
+"""Images from which on the distortion centre is freed where every link is on its own. In fewer a tilt and a change of
+height stand for it, and pairs like those of ``examples.paper figure5`` are registered worse with it free."""
+
+_ENOUGH_IMAGES_OF_A_MOTION = 3  # the same where one camera explains all of them
 
 _ENOUGH_LINKS = 2000
 """Of more links, evenly chosen ones say which lens it is: all of them determine it many times over, and each of the

@@ -18,10 +18,12 @@ from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.robust.priors import LENS_PRIORS
 
-_FEW_VIEWS, _LENS_OVER_DEPTH = 3, 6.0
-"""Images from more than which depth does not look like a lens; times by which a lens must make what neighbours share
-smaller to be no depth itself: λ takes the blame for up to 3 times what is left of depth, in 14 pairs and triples of
-published sets, and for 12 to 18 times of what fisheyes of matches leave beside λ."""
+_FEW_VIEWS = 3  # images up to which depth may look like a lens
+
+_LENS_OVER_DEPTH = 6.0
+"""Factor by which a lens must reduce what neighbours share to be no depth itself: λ takes the blame for up to 3 times
+what is left of depth, in 14 pairs and triples of published sets, and for 12 to 18 times of what fisheyes of matches
+leave beside λ."""
 
 
 def choose_observable_lens(
