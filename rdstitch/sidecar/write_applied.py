@@ -33,9 +33,9 @@ def applied_sidecar(result: Recomposition, *, same_lens: bool) -> dict[str, Any]
     # An image without any image in it is never written.
     source = sources.get(saved.reference) or next(iter(sources.values()))
     # How far the camera was determined then.
-    names = ("lens_covariance", "lambda_observable", "tilt_deg", "tilt_std_deg")
+    names = ("lambda_std", "lens_covariance", "lambda_observable", "tilt_deg", "tilt_std_deg")
     determined = {name: getattr(then.camera, name) for name in names}
-    determined |= {"lambda_std": then.lambda_std, "focal_std_px": _resized_std(then.camera, source.camera.focal)}
+    determined["focal_std_px"] = _resized_std(then.camera, source.camera.focal)
     camera = camera_record(source.camera.turned(inverse(source.metadata.orientation)))
     if same_lens:
         camera = replace_fields(camera, **determined)
