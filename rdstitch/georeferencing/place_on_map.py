@@ -102,9 +102,10 @@ def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georef
     latitude, longitude = np.array([(p.place.latitude, p.place.longitude) for p, _ in checks]).T
     right = place.crs.project(latitude, longitude)
     off = place.to_map([(pixel.real, -pixel.imag) for _, pixel in checks]) - right
-    residuals = [
-        Residual(p.name, east, north, True) for (p, _), (east, north) in zip(checks, off.tolist(), strict=True)
-    ]
+    residuals = (
+        Residual.of(point.name, complex(*error), used=True)
+        for (point, _), error in zip(checks, off.tolist(), strict=True)
+    )
     return replace(place, checks=tuple(residuals)), reason
 
 
@@ -150,7 +151,7 @@ def _placed(
         )
         if not force:
             return None, f"{reason}; --georeference force places it nevertheless"
-    residuals = tuple(Residual(n, e.real, e.imag, u) for n, e, u in zip(names, off, used.tolist(), strict=True))
+    residuals = tuple(map(Residual.of, names, off.tolist(), used.tolist()))
     assumption = _assumption(views, fit) if source == GPS else ""
     hills = located.relief * views.pixel
     if located.lever_std and np.isfinite(views.height).any():

@@ -210,7 +210,7 @@ def _placed(saved: SavedRegistration, used: Mapping[int, Source], lens: BandLens
         list(used).index(saved.reference) if saved.reference in used else None,
         [
             None if field is None else field.resized(source.camera.image_size)
-            for field, source in ((saved.images[index].displacement_field(), source) for index, source in used.items())
+            for field, source in ((saved.images[index].displacement_field, source) for index, source in used.items())
         ],
         saved.turned,
         saved.place,

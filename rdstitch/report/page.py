@@ -185,12 +185,16 @@ def place_section(result: StitchResult) -> str:
     """Where the output lies on the Earth, and the largest residuals of the positions that say so."""
     if (placed := result.georeference) is None:
         return ""
-    residuals = sorted(placed.residuals, key=lambda residual: -residual.off)[:_MAX_ROWS]
-    rows = [(r.name, f"{r.east:+.3f}", f"{r.north:+.3f}", "" if r.used else "not used") for r in residuals]
+    residuals = sorted(placed.residuals, key=lambda residual: -residual.distance)[:_MAX_ROWS]
+    rows = [(r.name, _signed(r.east), _signed(r.north), "" if r.used else "not used") for r in residuals]
     explanation = (
         f"{map_summary(placed)}. Where the output has them less where they were measured to be, the largest first:"
     )
     return section("Place on the Earth", explanation, table(rows, ("", "east, m", "north, m", "")))
+
+
+def _signed(value: float | None) -> str:
+    return "" if value is None else f"{value:+.3f}"
 
 
 def local_alignment(result: StitchResult) -> str:

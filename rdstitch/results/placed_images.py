@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.compositing import Canvas
-from rdstitch.compositing.source_images import Displacement, PlacedImage
+from rdstitch.compositing.source_images import PlacedImage
 from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
 from rdstitch.compositing.visible_region import VisibleRegion
 from rdstitch.geometry.camera import Camera
@@ -22,6 +22,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.io.radiometric_tags import Radiometry
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction
+from rdstitch.local_alignment import DisplacementField
 from rdstitch.results.registration import Registration
 
 # Images, and pixels of their longer side, that are compared to find what is static in them.
@@ -47,7 +48,7 @@ class PlacedImages:
     homographies: FloatArray
     reference: int | None  # image whose resolution the output has; None for the median one's
     # what local alignment adds to the measured pixels of each image
-    displacements: Sequence[Displacement | None] | None = None
+    displacements: Sequence[DisplacementField | None] | None = None
     # whether the camera turned on the spot, so that the homographies lead to directions, not to a plane
     turned: bool = False
     place: Georeference | None = None  # of the plane, where it is known from an earlier run
@@ -60,7 +61,7 @@ class PlacedImages:
     grid: SavedGrid | None = None  # pixels that the output is made on
 
     @classmethod
-    def of(cls, registration: Registration, displacements: Sequence[Displacement | None] | None) -> Self:
+    def of(cls, registration: Registration, displacements: Sequence[DisplacementField | None] | None) -> Self:
         """Those that a registration uses."""
         alignment = registration.alignment
         used = np.flatnonzero(alignment.used)

@@ -21,7 +21,7 @@ from rdstitch.geometry.crs import Crs
 from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.georeferencing.camera_views import views_of
-from rdstitch.georeferencing.georeference import Georeference, map_summary, world_file_paths
+from rdstitch.georeferencing.georeference import Georeference, Residual, map_summary, world_file_paths
 from rdstitch.georeferencing.map_grid import MapGrid
 from rdstitch.georeferencing.place_on_map import Located, place_on_map
 from rdstitch.inputs.named_system import NamedSystem
@@ -29,6 +29,7 @@ from rdstitch.io import ImageSpec, write_strips
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.map_canvas import plan_on_map
+from rdstitch.pipeline.output_messages import place_messages
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.report import report_page
 from rdstitch.results.stitch_result import StitchResult
@@ -225,11 +226,20 @@ def test_one_bad_position_of_eight_is_named_and_left_out(wrong: GpsPosition, off
     whole, _ = place_on_map(replace(row, positions=[*before, None, *after]))
     place, _ = place_on_map(replace(row, positions=[*before, wrong, *after]))
     assert (place.used, len(place.residuals)) == (7, 8)
-    ((name, away),) = place.rejected
-    assert name == "4.jpg"
-    assert away == pytest.approx(off, rel=0.2)
+    (rejected,) = place.rejected
+    assert rejected.name == "4.jpg"
+    assert rejected.distance == pytest.approx(off, rel=0.2)
     corner = [(0.0, 0.0)]
     np.testing.assert_allclose(place.to_map(corner), whole.to_map(corner), atol=0.1)
+
+
+def test_what_lies_beyond_the_horizon_has_no_residual() -> None:
+    row = _row(8)
+    row.to_output[4] *= -1.0
+    place, _ = place_on_map(row)
+    assert place.rejected == (Residual("4.jpg", None, None, used=False),)
+    texts = [message.text for message in place_messages(place, "", stitched(registration()).placed)]
+    assert "GPS positions that have no place in the output were not used: 4.jpg" in texts
 
 
 def test_control_points_place_the_output_instead_of_positions() -> None:
@@ -247,12 +257,13 @@ def test_control_points_place_the_output_instead_of_positions() -> None:
             control[image].append(GroundControl(f"P{number}", GpsPosition(latitude, longitude), 32632, (u, v)))
     place, _ = place_on_map(replace(row, control=control))
     assert (place.crs, place.source, place.used) == (Crs(32632), "ground control points", 5)
-    assert [name for name, _ in place.rejected] == ["P4"]
-    assert place.rejected[0][1] == pytest.approx(2.0 * 2**0.5, rel=0.01)
+    (rejected,) = place.rejected
+    assert rejected.name == "P4"
+    assert rejected.distance == pytest.approx(2.0 * 2**0.5, rel=0.01)
     np.testing.assert_allclose(
         place.to_map([(0.0, 0.0), (2000.0, 300.0)]), truth.to_map([(0, 0), (2000, 300)]), atol=0.01
     )
-    assert max(r.off for r in place.residuals if r.used) < 0.01
+    assert max(r.distance for r in place.residuals if r.used) < 0.01
     few = [points if k < 2 else [] for k, points in enumerate(control)]
     assert place_on_map(replace(row, control=few))[1] == ("2 ground control points are in the images, and 3 are needed")
 
@@ -532,6 +543,6 @@ def test_a_strip_that_drifts_bends_back_onto_its_control_points(tmp_path: Path) 
 
     seen = [to_plane(alignment.cameras[k], alignment.homographies[k], pixels[k : k + 1])[0] for k in range(14)]
     fit = fit_similarity(np.array(seen) @ [1.0, -1.0j], places @ [1.0, 1.0j], 1e3)
-    without, checks = fit.residuals[1::3], np.array([check.off for check in held.georeference.checks])
+    without, checks = fit.residuals[1::3], np.array([check.distance for check in held.georeference.checks])
     assert np.sqrt(np.mean(checks**2)) < 0.5 * np.sqrt(np.mean(without**2))
     assert np.sqrt(np.mean(checks**2)) < 3.0 * held.georeference.rms
