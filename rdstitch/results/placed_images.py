@@ -1,7 +1,7 @@
 """Registered images, ready to be composited: aligned locally, without what is static."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Self
@@ -15,9 +15,8 @@ from rdstitch.compositing.source_images import PlacedImage
 from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
 from rdstitch.compositing.visible_region import VisibleRegion
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.places import GpsPosition
 from rdstitch.georeferencing.georeference import Georeference
-from rdstitch.georeferencing.place_on_map import Located, has_place
+from rdstitch.georeferencing.place_on_map import AlignmentErrors, has_place
 from rdstitch.inputs.source import Source
 from rdstitch.io.radiometric_tags import Radiometry
 from rdstitch.io.read import DecodedImage
@@ -55,9 +54,7 @@ class PlacedImages:
     whole: bool = False  # whether nothing of them can be static: tiles on a stage, whose ground may be black
     # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.straighten`
     orientation: FloatArray | None = None
-    relief: float = 0.0  # pixels that neighbours are off together, where the ground is no plane
-    lever_std: float = 0.0  # see Located
-    leverage: Mapping[int | str, float] = field(default_factory=dict)  # see Located
+    errors: AlignmentErrors = field(default_factory=AlignmentErrors)
     grid: SavedGrid | None = None  # pixels that the output is made on
 
     @classmethod
@@ -73,9 +70,12 @@ class PlacedImages:
             displacements,
             alignment.on_sphere,
             whole=registration.tiles is not None,
-            relief=alignment.relief.size if alignment.relief.found else 0.0,
-            lever_std=alignment.lever_std,
-            leverage={**alignment.leverage, **{k: alignment.leverage.get(int(i), 0.0) for k, i in enumerate(used)}},
+            errors=AlignmentErrors(
+                alignment.relief.size if alignment.relief.found else 0.0,
+                alignment.lever_std or None,
+                [alignment.leverage.get(i, 0.0) for i in used.tolist()],
+                {key: value for key, value in alignment.leverage.items() if isinstance(key, str)},
+            ),
         )
 
     @cached_property
@@ -90,28 +90,9 @@ class PlacedImages:
         return static_pixels([alike[k].read(reduction, keep=True).pixels for k in chosen])
 
     @property
-    def positions(self) -> list[GpsPosition | None]:
-        """Where each image was taken; a camera that turned on the spot was at one place, and shows no plane."""
-        return [None if self.turned else source.metadata.gps for source in self.sources]
-
-    @property
     def has_place(self) -> bool:
         """Whether enough is known for a place of the output on the Earth to be expected."""
         return not self.turned and has_place(self.sources)
-
-    def located(self, canvas: Canvas) -> Located:
-        """The images on a canvas with what is known of where they are."""
-        return Located(
-            self.positions,
-            self.cameras,
-            canvas.matrix @ self.homographies,
-            [source.name for source in self.sources],
-            [source.metadata.nadir for source in self.sources],
-            [source.control for source in self.sources],
-            self.relief,
-            self.lever_std,
-            self.leverage,
-        )
 
     def images(self, canvas: Canvas) -> list[PlacedImage]:
         """As the compositor takes them, with only the near parts of those that a canvas does not show whole."""
