@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,8 +44,8 @@ class Views:
 
     def take(self, chosen: BoolArray | IntArray) -> Self:
         """Some of them."""
-        ground, foot, height, right = (each[chosen] for each in (self.ground, self.foot, self.height, self.right))
-        return replace(self, ground=ground, foot=foot, height=height, right=right)
+        columns: dict[str, Any] = {name: getattr(self, name)[chosen] for name in ("ground", "foot", "height", "right")}
+        return replace(self, **columns)
 
 
 def views_of(
