@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from numbers import Real
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -38,7 +38,10 @@ from rdstitch.geometry.planar_motion import turned_tilt
 LENS_PARAMETERS = ("distortion", "distortion2", "distortion3", "center_x", "center_y")
 """The parameters of a lens: λ, μ, ν, and the distortion centre, in the half-diagonal frame."""
 
-FOCAL_LOG_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "guess": 0.3}
+FocalSource = Literal["option", "file", "estimate", "exif", "guess"]
+"""Where a focal length comes from."""
+
+FOCAL_LOG_STD: dict[FocalSource, float] = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "guess": 0.3}
 """Standard deviation of the logarithm of a focal length, by where it comes from."""
 
 _LEAST_LOG_STD = 1e-6  # of a focal length: what is exact has no inverse variance
@@ -151,7 +154,7 @@ class Camera:
     distortion2: float = 0.0
     center: tuple[float, float] = None  # type: ignore[assignment]  # never so once it is made
     focal: float | None = None
-    focal_source: str | None = None
+    focal_source: FocalSource | None = None
     distortion_std: float | None = None
     distortion3: float = 0.0
     lens_covariance: tuple[tuple[float, ...], ...] | None = field(default=None, repr=False)
@@ -303,7 +306,7 @@ class Camera:
             return max(self.focal_std / self.focal, _LEAST_LOG_STD)
         return FOCAL_LOG_STD[self.focal_source or "guess"]
 
-    def with_focal(self, focal: float | None = None, source: str = "guess", std: float | None = None) -> Self:
+    def with_focal(self, focal: float | None = None, source: FocalSource = "guess", std: float | None = None) -> Self:
         """The camera with a focal length; without one given, with a guessed one where none is known."""
         if focal is None and self.focal is not None:
             return self

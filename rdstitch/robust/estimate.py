@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from rdstitch.arrays import FloatArray, IntArray, as_numbers
 from rdstitch.choices import SolverName
 from rdstitch.errors import ArgumentError
-from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.camera import Camera, FocalSource
 from rdstitch.geometry.radial_homography import RadialHomography, are_homographies
 from rdstitch.options.estimation_options import EstimationOptions
 from rdstitch.robust.chance import MIN_OCCUPIED_CELLS, occupied_cells, rejection_reason
@@ -96,7 +96,7 @@ def estimate_radial_homography(
     *,
     image_size2: tuple[int, int] | None = None,
     focal: float | None = None,
-    focal_source: str | None = None,
+    focal_source: FocalSource | None = None,
     center: tuple[float, float] | None = None,
     solver: SolverName = "auto",
     tilt: ArrayLike | None = None,

@@ -46,7 +46,7 @@ from typing import Self
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.camera import Camera, FocalSource
 from rdstitch.robust.loss import normal_std
 
 TWENTY_TO_ONE = 6.0
@@ -137,14 +137,14 @@ def exact(value: float) -> Prior:
     return Prior(((1.0, value, _EXACT_STD),))
 
 
-def focal_prior(log_focal: float, std: float, source: str) -> Prior:
+def focal_prior(log_focal: float, std: float, source: FocalSource) -> Prior:
     """The prior on log f, f in half diagonals, by where a focal length comes from."""
     if source not in ("exif", "guess"):
         return Prior(((1.0, log_focal, std),))
     return Prior(((0.9, log_focal, std), (0.1, math.log(1.5), 0.7)))
 
 
-def known_focal(cameras: Sequence[Camera]) -> tuple[float, float, str]:
+def known_focal(cameras: Sequence[Camera]) -> tuple[float, float, FocalSource]:
     """Median and standard deviation of the logarithm of the focal length in half diagonals, and where it comes from.
 
     The cameras are of one lens: where most differ, as those of a zoom do, it is as uncertain as they scatter.

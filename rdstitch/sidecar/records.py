@@ -14,7 +14,8 @@ import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
 from rdstitch.alignment.result import LinkFit
-from rdstitch.geometry.camera_record import CameraRecord, FocalSource
+from rdstitch.geometry.camera import FocalSource
+from rdstitch.geometry.camera_record import CameraRecord
 from rdstitch.local_alignment import HeldOut, LocalAlignment
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration

@@ -8,7 +8,7 @@ from typing import Any, cast
 import cv2
 import numpy as np
 
-from rdstitch.geometry.camera_record import FocalSource, camera_record
+from rdstitch.geometry.camera_record import camera_record
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.image_record import ImageRecord, PoseRecord, image_fields, placement_fields
 from rdstitch.sidecar.output_record import OutputRecord, SeamsRecord
@@ -45,7 +45,7 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
         camera=camera,
         tilt_deg=None if alignment.tilt is None else np.degrees(alignment.tilt).tolist(),
         focal_px=registration.camera.focal,
-        focal_source=cast(FocalSource | None, registration.camera.focal_source),
+        focal_source=registration.camera.focal_source,
         model=cast(Model, alignment.model),
         model_reason=alignment.model_reason,
         rms_px=alignment.rms,

@@ -12,7 +12,7 @@ import numpy as np
 from rdstitch.alignment.least_squares.plane_marks import ControlPoints, PlaneMarks
 from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, X, Y
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.geometry.camera import LENS_PARAMETERS
+from rdstitch.geometry.camera import LENS_PARAMETERS, FocalSource
 from rdstitch.robust.posterior import LENS, TILT, Prior, exact, focal_prior
 
 _MOST_BARREL = 0.375
@@ -47,7 +47,7 @@ class CameraPriors:
 
     log_focal: float  # log_focal, log_focal_std: of the logarithm of the focal length in half diagonals
     log_focal_std: float
-    focal_source: str  # where it comes from, a key of FOCAL_LOG_STD
+    focal_source: FocalSource  # where it comes from, a key of FOCAL_LOG_STD
     tilt: tuple[float, float]  # (ψ, θ), radians
     tilt_known: bool
     # (N, 2): how the tilt of each image differs from the shared one, radians; zeros where that is not known

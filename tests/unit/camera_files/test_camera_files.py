@@ -19,7 +19,7 @@ from rdstitch.camera_files import export_note, load_camera, read_camera_file, sa
 from rdstitch.camera_files.polynomials import fitted_polynomial
 from rdstitch.choices import CameraFormat
 from rdstitch.errors import InputError, OutputError
-from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.camera import Camera, FocalSource
 from rdstitch.geometry.lens_model import LensModel
 from rdstitch.system.records import parse_yaml
 
@@ -93,7 +93,7 @@ def test_focal_length_and_tilt_keep_their_standard_deviations(tmp_path: Path, na
 @pytest.mark.parametrize("source", ["guess", "exif"])
 @pytest.mark.parametrize("name", NAMES)
 def test_a_focal_length_that_was_guessed_is_no_calibration_by_being_saved(
-    tmp_path: Path, name: str, source: str
+    tmp_path: Path, name: str, source: FocalSource
 ) -> None:
     camera = Camera((640, 480), -0.2, focal=512.0, focal_source=source)
     save_camera(camera, tmp_path / name)
