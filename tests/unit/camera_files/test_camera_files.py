@@ -312,6 +312,33 @@ def test_opendronemap_of_others(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("model", "parameters"),
+    [
+        ("SIMPLE_DIVISION", [1500.0, 810.5, 590.5, -0.2]),
+        ("DIVISION", [1500.0, 1500.0, 810.5, 590.5, 0.1]),
+        ("SIMPLE_FISHEYE", [900.0, 810.5, 590.5]),
+        ("FISHEYE", [900.0, 905.0, 810.5, 590.5]),
+    ],
+)
+def test_cameras_of_colmap_4_mean_what_it_says(tmp_path: Path, model: str, parameters: list[float]) -> None:
+    pycolmap = pytest.importorskip("pycolmap", "4.0")
+    numbers = " ".join(map(repr, parameters))
+    (tmp_path / "cameras.txt").write_text(f"1 {model} 1600 1200 {numbers}\n", encoding="utf-8")
+    camera = load_camera(tmp_path / "cameras.txt")
+    lens, points = camera.lens_model or camera, _points(camera)
+    theirs = pycolmap.Camera(model=model, width=1600, height=1200, params=parameters).cam_from_img(points + 0.5)
+    # What is within 1/32 pixel of a division model is read as that.
+    tolerance = 1e-6 if "DIVISION" in model else 1.0 / 32.0
+    np.testing.assert_allclose(lens.distort(theirs * camera.focal + camera.center), points, atol=tolerance)
+
+
+def test_a_division_model_of_colmap_has_square_pixels(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 DIVISION 1600 1200 1500 1510 810.5 590.5 -0.2\n", encoding="utf-8")
+    with pytest.raises(InputError, match="needs one focal length"):
+        load_camera(tmp_path / "cameras.txt")
+
+
+@pytest.mark.parametrize(
     ("model", "values"),
     [
         ("SIMPLE_PINHOLE", [1500.0]),
