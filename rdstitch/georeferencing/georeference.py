@@ -23,7 +23,7 @@ from rdstitch.io.tiff import ExtraTag
 PositionKind = Literal["GPS positions", "ground control points"]
 GPS: PositionKind = "GPS positions"
 CONTROL: PositionKind = "ground control points"
-MODEL_SCALE, MODEL_TIEPOINT, MODEL_TRANSFORMATION, GEO_KEYS = 33550, 33922, 34264, 34735
+_MODEL_SCALE, _MODEL_TIEPOINT, _MODEL_TRANSFORMATION, _GEO_KEYS = 33550, 33922, 34264, 34735
 _SHORT, _DOUBLE = 3, 12
 
 
@@ -54,8 +54,8 @@ class Georeference:
     crs: Crs
     scale: complex  # metres per pixel times the turn: easting + i northing = ``scale`` (x - i y) + ``origin``
     origin: complex  # easting + i northing of the centre of the top-left pixel, m
-    # root mean square distance of the positions used from where all others and the images put them, m
-    rms: float
+    # root mean square distance of the positions used from where all others and the images put them, m; None of a grid
+    rms: float | None = None
     source: PositionKind = GPS  # what the positions are
     residuals: tuple[Residual, ...] = ()  # of every position
     # standard deviation of one coordinate of a place on the ground, in the mean over the positions, m
@@ -137,13 +137,13 @@ class Georeference:
         keys = (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, self.crs.epsg)
         if self.north_up:  # as more programs read it
             place = [
-                (MODEL_SCALE, _DOUBLE, 3, (a, a, 0.0), True),
-                (MODEL_TIEPOINT, _DOUBLE, 6, (0.0, 0.0, 0.0, corner.real, corner.imag, 0.0), True),
+                (_MODEL_SCALE, _DOUBLE, 3, (a, a, 0.0), True),
+                (_MODEL_TIEPOINT, _DOUBLE, 6, (0.0, 0.0, 0.0, corner.real, corner.imag, 0.0), True),
             ]
         else:
             matrix = (a, b, 0.0, corner.real, b, -a, 0.0, corner.imag, *(0.0,) * 7, 1.0)
-            place = [(MODEL_TRANSFORMATION, _DOUBLE, len(matrix), matrix, True)]
-        return [*place, (GEO_KEYS, _SHORT, len(keys), keys, True)]
+            place = [(_MODEL_TRANSFORMATION, _DOUBLE, len(matrix), matrix, True)]
+        return [*place, (_GEO_KEYS, _SHORT, len(keys), keys, True)]
 
     def world_file_texts(self) -> tuple[str, str]:
         """The contents of :func:`world_file_paths`."""
@@ -167,11 +167,11 @@ def map_summary(place: Georeference) -> str:
     """What there is to say of a georeference, in one line."""
     side = "left" if place.clockwise_deg > 0 else "right"
     turned = "" if place.north_up else f", north {abs(place.clockwise_deg):.1f}° {side} of up"
-    what, agree = ("GPS", "agree with the map") if place.source == GPS else (place.source, "agree")
-    text = (
-        f"georeferenced: {place.crs.name}, {place.gsd:.4g} m a pixel{turned}; {what} {agree} to "
-        f"{metres(place.rms)} ({place.used} of {len(place.residuals)}, each predicted by the others)"
-    )
+    text = f"georeferenced: {place.crs.name}, {place.gsd:.4g} m a pixel{turned}"
+    if place.rms is not None:
+        agreeing = "GPS agree with the map" if place.source == GPS else f"{place.source} agree"
+        count = f"{place.used} of {len(place.residuals)}"
+        text += f"; {agreeing} to {metres(place.rms)} ({count}, each predicted by the others)"
     if place.source == CONTROL:
         text += f", worst {_worst(place, place.residuals)}"
     return text if place.std is None else f"{text}; map ± {metres(place.std)}"

@@ -66,7 +66,7 @@ class GeoreferenceRecord(Struct, kw_only=True):
             Crs(int(self.crs.removeprefix("EPSG:"))),
             complex(a, b),
             complex(east, north),
-            self.rms_m or 0.0,
+            self.rms_m,
             self.source or GPS,
             self.residuals,
             self.std_m,

@@ -275,7 +275,7 @@ def test_what_lies_beyond_the_horizon_has_no_residual() -> None:
 def test_control_points_place_the_output_instead_of_positions() -> None:
     """A point in two images counts once; one that is 2 m off is named; the system is that of the list."""
     row = _row(8)
-    truth = Georeference(Crs(32632), 0.05 * np.exp(0.2j), complex(448_000.0, 5_500_000.0), 0.0)
+    truth = Georeference(Crs(32632), 0.05 * np.exp(0.2j), complex(448_000.0, 5_500_000.0))
     control: list[list[GroundControl]] = [[] for _ in row.positions]
     for number, (x, y) in enumerate(
         [(40.0, 90.0), (330.0, -80.0), (900.0, 70.0), (1000.0, 10.0), (1500.0, 130.0), (2100.0, 90.0)]
@@ -375,7 +375,7 @@ def test_pixels_that_stay_keep_their_place(scale: complex) -> None:
 
 
 def test_a_part_of_a_grid_whose_south_is_up_has_the_same_pixels() -> None:
-    grid = MapGrid((100, 80), Georeference(Crs(32632), -0.5 + 0.0j, 400_000.0 + 5_000_000.0j, 0.0))
+    grid = MapGrid((100, 80), Georeference(Crs(32632), -0.5 + 0.0j, 400_000.0 + 5_000_000.0j))
     part = grid.within((399_960.25, 5_000_009.75, 399_990.25, 5_000_030.25))
     assert (part.size, part.place.scale) == ((60, 41), grid.place.scale)
     np.testing.assert_allclose(part.place.to_map([(0.0, 0.0)]), [(399_990.0, 5_000_010.0)])
@@ -419,7 +419,7 @@ def _survey(
     """20 cameras 40 m up, of one tilt and yaws within ``yaw``, and the right place of their output."""
     rng = np.random.default_rng(seed)
     camera = Camera((480, 360), focal=400.0, focal_source="estimate", focal_std=0.4, tilt=tilt, tilt_std=(1e-4, 1e-4))
-    truth = Georeference(Crs(32733), 0.1 * np.exp(0.3j), complex(500_000.0, 7_000_000.0), 0.0)
+    truth = Georeference(Crs(32733), 0.1 * np.exp(0.3j), complex(500_000.0, 7_000_000.0))
     across, along = np.meshgrid(np.arange(5) * 150.0, np.arange(4) * 150.0)
     feet = np.stack([across.ravel(), along.ravel()], axis=1) + rng.normal(0.0, 10.0, (20, 2))
     heights = rng.normal(400.0, 8.0, 20)
