@@ -205,15 +205,14 @@ def _placed(saved: SavedRegistration, used: Mapping[int, Source], lens: BandLens
     to_registered = np.eye(3) if lens is None else np.linalg.inv(lens.homography)
     return PlacedImages(
         list(used.values()),
-        [source.camera for source in used.values()],
         np.array([saved.images[index].to_plane for index in used], dtype=np.float64) @ to_registered,
         list(used).index(saved.reference) if saved.reference in used else None,
         [
             None if field is None else field.resized(source.camera.image_size)
-            for field, source in ((saved.images[index].displacement_field(), source) for index, source in used.items())
+            for field, source in ((saved.images[index].displacement_field, source) for index, source in used.items())
         ],
         saved.turned,
         saved.place,
-        whole=saved.record.stage is not None,
+        tiles=saved.record.stage is not None,
         orientation=saved.orientation,
     )

@@ -80,7 +80,8 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
             if epsg is not None:
                 place = place.in_system(Crs(epsg), np.concatenate(canvas.footprints))
         else:
-            place, reason = place_on_map(placed.located(canvas), epsg, force=options.georeference == "force")
+            force, to_output = options.georeference == "force", canvas.matrix @ placed.homographies
+            place, reason = place_on_map(placed.sources, to_output, placed.errors, epsg, force=force)
     if place is None:
         for name in ("gsd", "like", "extent"):
             if getattr(options, name) is not None:

@@ -30,7 +30,7 @@ def tiles_as_registration(sources: Sequence[Source], tiled: TileRegistration) ->
             f"({tiled.grid.source}) or the overlap may be wrong; --search PX looks farther"
         )
     distortion, std = fitted.distortion, fitted.distortion_std
-    cameras = [replace(source.camera, distortion=distortion, distortion_std=std) for source in sources]
+    cameras = [replace(source.camera, distortion=distortion, distortion_std=std or None) for source in sources]
     places = fitted.places - fitted.places[0]
     exact = _homographies(cameras, places)
     pairs, fits = zip(*(_pair(tiled, cameras, exact, number) for number in range(len(links.tiles))), strict=True)
