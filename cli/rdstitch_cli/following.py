@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import click
 
-from rdstitch.options.option import Option
+from rdstitch.options.option import Option, Range
 from rdstitch_cli.stitching import warn_of
 from rdstitch_cli.terminal import Reporter
 
@@ -34,7 +34,7 @@ Idle = Annotated[
     Option(
         "With --follow: end after so long without a frame; otherwise a folder is followed until Ctrl-C.",
         "SECONDS",
-        above=0.0,
+        within=Range(above=0.0),
     ),
 ]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from rdstitch.choices import PosesFrame
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import Options, documented, option
+from rdstitch.options.option import FileUse, Options, documented, option
 from rdstitch.options.shared_options import Height
 
 _REPORT_SUFFIXES = (".html", ".htm")
@@ -17,28 +17,28 @@ class FilesBeside(Options):
     """What is written beside an image, published together with it; the report of a result that is refused too."""
 
     report: Path | None = option(
-        None, "Write a report to FILE (.html): graph, votes on λ, matches, residuals.", "FILE", writes=True
+        None, "Write a report to FILE (.html): graph, votes on λ, matches, residuals.", "FILE", file=FileUse.WRITTEN
     )
     layers: Path | None = option(
         None,
         "Write each image, warped, with alpha, and its mask into DIR: TIFF, cropped, with the offsets that "
         "enblend reads.",
         "DIR",
-        writes=True,
+        file=FileUse.WRITTEN,
     )
     whole_layers: bool = option(False, "With --layers: on the whole canvas instead of cropped.")
     hugin_project: Path | None = option(
         None,
         "Write a project for Hugin (.pto): all images with lens and pose, and control points.",
         "FILE",
-        writes=True,
+        file=FileUse.WRITTEN,
     )
     poses: Path | None = option(
         None,
         "Write the pose of the camera for each image: CSV with covariances, as 'rdstitch trajectory' does; "
         "images.txt: COLMAP's; geo.txt: OpenDroneMap's.",
         "FILE",
-        writes=True,
+        file=FileUse.WRITTEN,
     )
     frame: PosesFrame = option(
         "enu",
@@ -52,7 +52,7 @@ class FilesBeside(Options):
         "Write map.yaml and map.png, which nav2_map_server loads, into DIR; in metres by --height, with the first "
         "image at the origin and its top along x.",
         "DIR",
-        writes=True,
+        file=FileUse.WRITTEN,
     )
     command: str = ""  # the command line, for the report
 

@@ -161,11 +161,9 @@ def _laid_out(
 
 def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions) -> SavedGrid | None:
     """The pixels of the saved output, where images of the same sizes are to have the same: bands, and dates."""
-    pixels = [name for name, each in declared(CompositeOptions).items() if each.option.pixels]
-    asked = any(getattr(options, name) != getattr(saved.composite, name) for name in pixels)
     matrix, size = saved.plane_to_output, saved.record.output.size
     same_sizes = all(saved.images[index].size == source.camera.image_size for index, source in used.items())
-    alike = same_sizes and not asked and not saved.turned and options.same_turn(saved.composite)
+    alike = same_sizes and not saved.turned and options.same_canvas(saved.composite)
     return SavedGrid(matrix, size, saved.output_place) if alike and matrix is not None and size is not None else None
 
 

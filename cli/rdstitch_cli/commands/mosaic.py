@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from rdstitch.options.files_beside import FilesBeside
-from rdstitch.options.option import Option
+from rdstitch.options.option import Option, Range
 from rdstitch.options.shared_options import Every
 from rdstitch.results.messages import shortened
 from rdstitch_cli.flags import ImageFile, Inputs, PrintSidecar, command, flags_of
@@ -64,7 +64,7 @@ def mosaic(
         Option(
             "With --follow: seconds between updates of the preview, OUTPUT with .preview.jpg; 0: none.",
             "SECONDS",
-            least=0.0,
+            within=Range(least=0.0),
         ),
     ] = 5.0,
     preview: Preview = False,

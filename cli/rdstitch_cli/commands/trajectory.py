@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
 from rdstitch.options.feature_options import FeatureOptions
-from rdstitch.options.option import Option
+from rdstitch.options.option import FileUse, Option
 from rdstitch.options.shared_options import Every, Height
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch_cli.flags import Inputs, command, flags_of
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 )
 def trajectory(
     inputs: Inputs,
-    output: Annotated[Path, Option("File to write.", "FILE", "-o --output", writes=True)],
+    output: Annotated[Path, Option("File to write.", "FILE", "-o --output", file=FileUse.WRITTEN)],
     *,
     file_format: Annotated[
         TrajectoryFormat,
@@ -50,7 +50,7 @@ def trajectory(
         ),
     ] = None,
     height: Height = None,
-    plot: Annotated[Path | None, Option("Draw the path to FILE (SVG).", "FILE", writes=True)] = None,
+    plot: Annotated[Path | None, Option("Draw the path to FILE (SVG).", "FILE", file=FileUse.WRITTEN)] = None,
     every: Every = 1,
     following: Following = False,
     idle: Idle = None,
