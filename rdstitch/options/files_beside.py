@@ -65,5 +65,11 @@ class FilesBeside(Options):
 
             check_suffix(self.report, _REPORT_SUFFIXES)
 
+    @property
+    def has_poses_on_map(self) -> bool:
+        """Whether the table of poses needs a map: also OpenDroneMap's, by its name; COLMAP's takes it where it is."""
+        name = "" if self.poses is None else self.poses.name.lower()
+        return name == "geo.txt" or (self.frame == "map" and name not in ("", "images.txt"))
+
 
 NOTHING_BESIDE = FilesBeside()

@@ -60,6 +60,10 @@ def read_inputs(
         if unread:
             few = "" if len(chosen) == 1 else "fewer than two images can be read; "
             raise InputError(f"{few}{unread[0].images[0]}: {unread[0].text}")
+        if len(chosen) < 2 <= len(frames):
+            raise ArgumentError(
+                f"--exclude and --include-only leave {len(chosen)} of {len(frames)} images; stitching needs two or more"
+            )
         twice = f"{chosen[0].path} is named twice: " if len(chosen) > 1 else ""
         raise ArgumentError(f"{twice}stitching needs two different images or more; name at least one more")
     sources = with_attitudes(with_masks(sources, options.mask), options.attitude)

@@ -64,19 +64,19 @@ def trajectory(
     poses are printed as frames arrive.
     """
     from rdstitch.export.trajectory_files import frame_of
+    from rdstitch.pipeline.output_plan import OutputPlan
     from rdstitch.pipeline.recipes import trajectory as recipe
     from rdstitch.pipeline.run import Run
-    from rdstitch.pipeline.run_files import RunFiles
     from rdstitch.results.pose import FollowedPoses
 
     options = stitch_options(given)
     with ExitStack() as stack:
         paths: Sequence[Named]
         if following:
-            run = Run.of(inputs, options, purpose=Purpose.TRAJECTORY)
-            files, options = RunFiles.of_path(run, inputs, output, plot, file_format), run.options
+            run = Run.of(inputs, options, Purpose.TRAJECTORY, every=every)
+            plan, options = OutputPlan.of_path(run, inputs, output, plot, file_format), run.options
             poses = FollowedPoses(height, frame or frame_of(file_format))
-            paths = stack.enter_context(followed(inputs, run, files, reporter, every=every, idle=idle, poses=poses))
+            paths = stack.enter_context(followed(plan, reporter, idle=idle, poses=poses))
         else:
             paths = resolve(inputs)
         _, registration = recipe(
