@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.alignment.odometry import along_odometry
 from rdstitch.alignment.trajectory import Trajectory
@@ -18,6 +19,7 @@ from rdstitch.inputs.times import timestamps_of
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message, shortened
 from rdstitch.results.registration import Registration
+from rdstitch.verification.limits import Limits
 
 
 def with_odometry_of_bag(inputs: Iterable[Named], options: StitchOptions) -> StitchOptions:
@@ -34,15 +36,16 @@ def camera_path(
     registration: Registration, odometry: Odometry | str | Path | None, height: float | None
 ) -> tuple[Trajectory, list[Message]]:
     """The path with names, numbers and times of the images, in ``height`` of the first one or the unit of the odometry;
-    and what that has shown of it.
+    and what the user should know of it.
     """
-    sources, messages = registration.sources, list[Message]()
+    sources, messages = registration.sources, _scale_uncertainty(registration.alignment)
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     stored = QuarterTurns.of(sources).back.alignment(registration.alignment)
     path = Trajectory.from_alignment(stored, height or 1.0)
     if odometry is not None:
         length_std = registration.alignment.length_std
-        path, messages = _along_odometry(path, sources, odometry, length_std, keep_unit=height is not None)
+        path, of_odometry = _along_odometry(path, sources, odometry, length_std, keep_unit=height is not None)
+        messages += of_odometry
     numbers = [source.number(k) for k, source in enumerate(sources)]
     return path.labelled([source.name for source in sources], numbers, timestamps_of(sources)), messages
 
@@ -71,3 +74,12 @@ def _along_odometry(
     if added := [sources[k].name for k in whole.frame.tolist() if k not in seen_frames]:
         messages.append(Message(f"placed by the odometry alone: {shortened(added)}", severity="note"))
     return whole, messages
+
+
+def _scale_uncertainty(alignment: Alignment) -> list[Message]:
+    """A warning where the focal length, and with it the length of every step, is hardly known."""
+    if not alignment.length_std > Limits.max_length_std:
+        return []
+    off = f"all lengths may be off together by {alignment.length_std:.0%}"
+    text = f"{off}: the images hardly show the focal length; give --focal"
+    return [Message(text, code="focal-unknown")]

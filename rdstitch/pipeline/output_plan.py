@@ -59,12 +59,7 @@ class OutputPlan:
         more_files: Sequence[Path] = (),
     ) -> Self:
         """Of a run over images of these names; ``more_images`` may follow its output."""
-        options, files = run.options, [*more_files]
-        if options.save_camera is not None:
-            from rdstitch.camera_files import format_of
-
-            format_of(options.save_camera, options.camera_format)
-            files.append(options.save_camera)
+        files = [*more_files, *_camera_file(run)]
         images = [*([] if run.output is None else [run.output]), *more_images]
         return cls(run, [*inputs, *run.read], images, files, list(_files_beside(run, names)))
 
@@ -79,6 +74,7 @@ class OutputPlan:
     ) -> Self:
         """Of a trajectory."""
         files, replaced = [Path(file) for file in (output, plot) if file is not None], None
+        files += _camera_file(run)
         if file_format == "bag" and output is not None:
             check_bag(files[0], overwrite=run.options.overwrite)
             if files[0].is_dir() and run.options.overwrite:  # as the bags of ROS 2 are
@@ -123,6 +119,17 @@ def report_refused(run: Run, refused: Registration) -> None:
     """Write the report of a result that is refused, so that one can see why; what fails then is not the reason."""
     with Outputs(overwrite=True) as outputs:
         stage_report(replace(run, outputs=outputs), refused)
+
+
+def _camera_file(run: Run) -> list[Path]:
+    """The camera file that is wanted, if any, of a format that there is."""
+    file = run.options.save_camera
+    if file is None:
+        return []
+    from rdstitch.camera_files import format_of  # with all formats, which most runs have no use for
+
+    format_of(file, run.options.camera_format)
+    return [file]
 
 
 def _image_files(output: Path) -> list[Path]:

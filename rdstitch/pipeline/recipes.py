@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
-from rdstitch.errors import ArgumentError, RegistrationError
+from rdstitch.errors import RegistrationError
 from rdstitch.export.trajectory_files import has_times, path_as_svg
 from rdstitch.export.write_trajectory import write_trajectory
 from rdstitch.inputs.find import FoundImages
@@ -18,11 +18,11 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import with_times
-from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside, ReportFile
 from rdstitch.options.option import check_parameter, options_of
 from rdstitch.options.shared_options import Height
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.accept import accept, scale_uncertainty
+from rdstitch.pipeline.accept import accept
 from rdstitch.pipeline.camera_path import camera_path
 from rdstitch.pipeline.choose_layout import choose_layout
 from rdstitch.pipeline.compose import compose_images
@@ -175,7 +175,7 @@ def calibrate(
     *,
     every: int | None = None,
     progress: Progress = silent,
-    beside: FilesBeside = NOTHING_BESIDE,
+    beside: ReportFile = NOTHING_BESIDE,
 ) -> Registration:
     """Find the lens from images of a plane; the camera is ``result.camera``.
 
@@ -196,9 +196,8 @@ def calibrate(
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
     """
-    if replace(beside, report=None, command="") != NOTHING_BESIDE:
-        raise ArgumentError("calibrate composites nothing: beside it there is a report only")
-    run = Run.of(inputs, options, Purpose.CALIBRATE, beside=beside, every=every, progress=progress)
+    files = FilesBeside.of(ReportFile, beside, "calibrate")
+    run = Run.of(inputs, options, Purpose.CALIBRATE, beside=files, every=every, progress=progress)
     with run.found() as images:
         OutputPlan.of_images(run, images.files).check()
         result = _registered(images, run)
@@ -253,12 +252,12 @@ def trajectory(
         numbers = frame_numbers(images.frames)
         numbered = [replace(frame, number=k) for frame, k in zip(images.frames, numbers, strict=True)]
         registration = _registered(replace(images, frames=numbered), run)
-        path, of_path = camera_path(registration, run.options.odometry, height)
-        messages = [*scale_uncertainty(registration.alignment), *of_path]
+        path, messages = camera_path(registration, run.options.odometry, height)
         if layout in ("tum", "bag") and not has_times(path):
             messages.append(_NO_TIMES)
         if output is not None:
             write_trajectory(path, Path(output), layout, frame, run.outputs)
+        _save_camera(registration, run)
         if plot is not None:
             drawn = text_bytes(path_as_svg(path, "heights" if height is None else "m"))
             messages += run.outputs.attempt(plot, partial(run.outputs.write, plot, drawn))

@@ -58,6 +58,8 @@ class Run:
         options, beside = options_of(StitchOptions, options), options_of(FilesBeside, beside, "beside")
         check_parameter("every", Every, every)
         given, file = as_inputs(inputs, options.channel_order), None if output is None else Path(output)
+        if options.dry_run and not purpose.picture:
+            raise ArgumentError(f"{purpose} composites nothing: leave out dry_run")
         if beside.frame == "first" and options.reference is not None:
             raise ArgumentError("reference and frame first both name the reference; leave one of them out")
         if beside.poses is not None:

@@ -20,13 +20,13 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.io.stored_tiles import StoredTile
 from rdstitch.local_alignment import no_local_alignment
-from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside, ImageFiles
 from rdstitch.options.option import options_of, with_fields
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.options.tile_options import TileOptions
+from rdstitch.pipeline.flat_field import NO_FLAT_FIELD, with_flat_field
 from rdstitch.pipeline.lay_out import lay_out
 from rdstitch.pipeline.output_plan import OutputPlan
-from rdstitch.pipeline.read_inputs import NO_FLAT_FIELD, with_flat_field
 from rdstitch.pipeline.recipes import compose_registration
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.tiles_as_registration import tiles_as_registration
@@ -56,7 +56,7 @@ def tiles(
     *,
     positions_file: str | Path | None = None,
     progress: Progress = silent,
-    beside: FilesBeside = NOTHING_BESIDE,
+    beside: ImageFiles = NOTHING_BESIDE,
     **fields: Any,
 ) -> StitchResult:
     """Stitch tiles taken on a stage, whose places are roughly known.
@@ -71,8 +71,10 @@ def tiles(
     options : TileOptions, optional
     positions_file : path, optional
         CSV file to write the places to as well; Fiji's list of tiles where its name ends in ``.txt``.
-    progress, beside
+    progress
         As for :func:`rdstitch.mosaic`.
+    beside : FilesBeside
+        What else is written: report, layers, a project of Hugin.
     **fields
         Fields of the options, instead of those in ``options``: ``tiles(arrays, positions=places, pixel_size=0.65)``.
 
@@ -82,7 +84,8 @@ def tiles(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = with_fields(options_of(TileOptions, options), fields)
-    run = replace(_tile_run(options, progress, output, beside), inputs=as_tiles(inputs))
+    files = FilesBeside.of(ImageFiles, beside, "tiles")
+    run = replace(_tile_run(options, progress, output, files), inputs=as_tiles(inputs))
     with run.found() as listed:
         registration, plan = _registered(listed, run, options, positions_file)
         with run.executor(len(registration.sources)) as executor:

@@ -210,6 +210,13 @@ def test_an_earlier_page_is_older(
     assert "the file of this name is older" in rdstitch(*arguments).err
 
 
+def test_a_map_that_cannot_be_made_leaves_nothing(rdstitch: Run, located: Path, tmp_path: Path) -> None:
+    arguments = ("mosaic", located / "flight", "-o", tmp_path / "field.png", "--model", "homography", *FAST)
+    done = rdstitch(*arguments, "--map-server", tmp_path / "map", "--height", "9", told="map: not written")
+    assert "is older" not in done.err
+    assert not (tmp_path / "map").exists()
+
+
 def test_layers_lie_where_the_output_does(rdstitch: Run, located: Path, tmp_path: Path) -> None:
     import rasterio
 

@@ -8,7 +8,7 @@ import click
 
 from rdstitch.errors import PartialResultError
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.options.files_beside import FilesBeside
+from rdstitch.options.files_beside import ReportFile
 from rdstitch.options.option import FileUse, Option
 from rdstitch.options.tile_options import TileOptions, measured_samples
 from rdstitch_cli.flags import Inputs, PrintSidecar, command, flags_of, values_of
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 """,
     flags_of(TileOptions),
     flags_of(measured_samples(), only="blend crop interpolation background max_memory scale max_size quality"),
-    flags_of(FilesBeside, only="report"),
+    flags_of(ReportFile),
 )
 def tiles(
     inputs: Inputs,

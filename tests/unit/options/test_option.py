@@ -203,5 +203,10 @@ def test_files_beside_neither_change_the_reference_nor_are_forgotten(tmp_path: P
     with pytest.raises(ArgumentError, match="--map-server is made from the output"):
         rdstitch.mosaic(images, beside=FilesBeside(map_server=tmp_path / "map", height=1.0))
     for beside in (FilesBeside(poses=tmp_path / "p.csv"), FilesBeside(layers=tmp_path / "layers")):
-        with pytest.raises(ArgumentError, match="calibrate composites nothing: beside it there is a report only"):
+        with pytest.raises(ArgumentError, match=r"calibrate writes no (poses|layers): beside its result"):
             rdstitch.calibrate(images, beside=beside)
+    with pytest.raises(ArgumentError, match=r"tiles writes no map_server: .* hugin_project, layers, report"):
+        rdstitch.tiles(images, tmp_path / "a.tif", beside=FilesBeside(map_server=tmp_path / "map"))
+    for recipe in (rdstitch.calibrate, rdstitch.trajectory):
+        with pytest.raises(ArgumentError, match=f"{recipe.__name__} composites nothing: leave out dry_run"):
+            recipe(images, options=StitchOptions(dry_run=True))
