@@ -15,6 +15,7 @@ from rdstitch.export.write_trajectory import write_trajectory
 from rdstitch.inputs.find import FoundImages
 from rdstitch.inputs.frame import Images, frame_numbers
 from rdstitch.inputs.input_guard import InputGuard
+from rdstitch.inputs.odometry import as_odometry
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import with_times
@@ -249,10 +250,11 @@ def trajectory(
     run = Run.of(inputs, options, Purpose.TRAJECTORY, every=every, progress=progress)
     with run.found() as images:
         OutputPlan.of_path(run, images.files, output, plot, layout).check()
+        odometry = as_odometry(run.options.odometry)
         numbers = frame_numbers(images.frames)
         numbered = [replace(frame, number=k) for frame, k in zip(images.frames, numbers, strict=True)]
         registration = _registered(replace(images, frames=numbered), run)
-        path, messages = camera_path(registration, run.options.odometry, height)
+        path, messages = camera_path(registration, odometry, height)
         if layout in ("tum", "bag") and not has_times(path):
             messages.append(_NO_TIMES)
         if output is not None:

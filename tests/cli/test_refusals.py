@@ -118,6 +118,7 @@ def _check(rdstitch: Run, folder: Path, arguments: list[str], status: int, *told
         (MOSAIC + "--poses geo.txt", 2, "geo.txt: poses on the map need GPS positions"),
         (MOSAIC + "--poses poses.csv --frame map", 2, "choose another --frame"),
         (FOLLOW + "new.png --dry-run", 2, "--follow has no --dry-run"),
+        ("trajectory a.png stranger.png -o path.csv --odometry drive.csv", 3, "drive.csv: "),
         *((PATH + f"--model {model}", 2, f"a {model} model has no path") for model in ("rotation", "homography")),
         ("mosaic . --exclude *.png -o out.png", 2, "--exclude and --include-only leave 0 of 3 images"),
         ("trajectory a.png b.png -o path --plot path", 6, "path: is the name of two outputs"),
