@@ -42,7 +42,7 @@ def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
         return canvas
     # The canvas has whole pixels around the images, and a full turn a multiple of some: these may be too many.
     spare = 1 if canvas.period is None else max(32, options.max_size // 128)
-    return _plan(placed, options, options.scale * (options.max_size - spare) / max(canvas.size))
+    return _plan(placed, options, options.scale * max(options.max_size - spare, 1) / max(canvas.size))
 
 
 def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canvas:

@@ -17,9 +17,10 @@ from rdstitch.matching.pair_estimator import FeatureMatching, PairEstimator
 from rdstitch.matching.repeated_pattern import match_repeated_patterns
 from rdstitch.matching.static_background import without_static_background
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.aligner import Aligner, draft_with_loops, impossible_estimates_fail
+from rdstitch.pipeline.aligner import Aligner, impossible_estimates_fail
 from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.image_circle import with_image_circle
+from rdstitch.pipeline.redraft import draft_with_loops
 from rdstitch.pipeline.repeated_patterns import match_crossings, settle_repeated_pattern
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.working_size import at_working_size

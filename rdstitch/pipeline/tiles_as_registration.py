@@ -47,6 +47,7 @@ def tiles_as_registration(sources: Sequence[Source], tiled: TileRegistration) ->
         model_reason="a stage moves without turning",
         rms=rms,
         links=fits,
+        lens_reason="given" if std == 0.0 else "one parameter",
         relief=ReliefTest(False, 0.0, 0.0, "Taken to be flat: tiles on a stage."),
     )
     counts = np.bincount(links.tiles[links.pair].ravel(), minlength=len(sources))

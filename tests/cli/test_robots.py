@@ -244,8 +244,10 @@ def test_a_calibrated_focal_length_is_as_sure_as_it_was(rdstitch: Run, tmp_path:
     assert abs(scale * 0.42 - 1.0) < 3.0 * float(stated[1]) / 100.0
 
 
-def test_python_gets_labels_too(frames: list[Path]) -> None:
-    path, _ = rdstitch.trajectory(frames, options=rdstitch.StitchOptions(focal=380.0, workers=1))
+def test_python_gets_labels_and_a_camera_file_too(frames: list[Path], tmp_path: Path) -> None:
+    options = rdstitch.StitchOptions(focal=380.0, workers=1, save_camera=tmp_path / "camera.json")
+    path, registration = rdstitch.trajectory(frames, options=options)
+    assert rdstitch.load_camera(tmp_path / "camera.json").distortion == registration.camera.distortion
     assert path.name == tuple(frame.name for frame in frames)
     assert path.source_frame.tolist() == [0, 1, 2]
     assert np.isnan(path.timestamp).all()

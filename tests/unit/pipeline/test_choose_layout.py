@@ -89,7 +89,7 @@ def test_where_heights_of_the_ground_explain_parallax_no_other_model_is_tried(by
     trials = _Trials(OPTIONS, False, lambda image: np.empty((0, 2, 2)))
     first = trials.lay_out(near, replace(no_local_alignment(""), by_heights=by_heights))
     assert first.faults
-    assert bool(list(_alternatives(near, [first], trials, aligner))) is not by_heights
+    assert bool(list(_alternatives(near, first, trials, aligner))) is not by_heights
 
 
 def test_what_a_homography_stretches_is_laid_out_as_a_turn(shared_data: Callable[[str], Path]) -> None:
