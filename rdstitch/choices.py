@@ -20,6 +20,7 @@ CameraFormat = Literal[
     "hugin",
     "lensfun",
 ]
+FocalSource = Literal["option", "file", "exif", "estimate", "guess"]  # where a focal length comes from
 ProjectionName = Literal["auto", "plane", "cylinder", "sphere", "mercator", "panini", "stereographic"]
 ChannelOrder = Literal["bgr", "rgb"]  # of arrays that come in or go out; OpenCV has the first
 ScanOrder = Literal["rows", "columns", "snake-rows", "snake-columns"]

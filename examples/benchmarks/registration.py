@@ -41,7 +41,7 @@ def print_pairs(count: int) -> None:
             truth = np.array([matches.truth.distortion for matches in made])
             pairs = []
             for matches in made:
-                camera = Camera(matches.truth.camera.image_size).with_focal()
+                camera = Camera(matches.truth.camera.image_size).with_guessed_focal()
                 pairs.append(PairMatches(matches.points1, matches.points2, camera, camera))
             print(f"\n{count} pairs of {MATCHES} matches, {motion}, {100 * outliers:.0f} % outliers")
             print(f"{'':34s}{'ms a pair':>10s}{'mean':>8s}{'|Δλ|':>9s}")

@@ -32,7 +32,7 @@ from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
-from rdstitch.robust.posterior import Prior
+from rdstitch.robust.priors import Prior
 
 RECIPE = "rdstitch as it is"
 

@@ -12,6 +12,7 @@ from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, SIMILARITY, THETA, TILTING, YAW, X, Y
 from rdstitch.alignment.starts import fit_model
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import FocalSource
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
@@ -63,7 +64,7 @@ def scene(
     per_link: int = 200,
     overlap: float = 0.2,
     guess: float | None = None,
-    focal_source: str | None = "option",
+    focal_source: FocalSource | None = "option",
     rng: np.random.Generator,
     reach: int | None = None,
     relief: float = 0.0,

@@ -53,7 +53,7 @@ def strip(kind: str, height: float, seed: int, images: int) -> Strip:
             points1, points2 = _matches(truth, i, j, rng)
             if len(points1) >= _MATCHES // 5:
                 pairs.append((i, j))
-                own = Camera(lens.image_size).with_focal()
+                own = Camera(lens.image_size).with_guessed_focal()
                 matched.append(PairMatches(points1, points2, own, own, np.zeros(len(points1)), None))
     relations = estimate_radial_homographies(matched, _OPTIONS)
     registered = [
@@ -62,7 +62,7 @@ def strip(kind: str, height: float, seed: int, images: int) -> Strip:
         if relation
     ]
     links = [pair.link() for pair in over_rough_ground(registered, _OPTIONS.threshold)]
-    return Strip(truth, lens.distortion, [Camera(lens.image_size).with_focal() for _ in range(images)], links)
+    return Strip(truth, lens.distortion, [Camera(lens.image_size).with_guessed_focal() for _ in range(images)], links)
 
 
 def _matches(truth: Sequence, i: int, j: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:

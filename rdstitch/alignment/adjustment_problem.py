@@ -28,7 +28,8 @@ POSE_TILT_SPREAD = math.radians(35.0)
 
 _TILT_SPREAD_START = math.radians(3.0)
 _MIN_TILT_SPREAD = math.radians(0.05)
-_ROUNDS, _SETTLED = 3, 0.1  # of estimating scales of priors, and by how much they still change at the end
+_ROUNDS = 3  # rounds of estimating the scales of priors
+_SETTLED = 0.1  # relative change of a scale that is none
 _MISFIT = 1.5  # times the errors of links on their own from which on those of a model are its own
 
 
@@ -37,23 +38,23 @@ class Fit:
     """One model adjusted to a problem."""
 
     model: MotionModel
-    adjusted: BundleAdjustmentResult
+    result: BundleAdjustmentResult
     tilt_spread: float | None = None  # standard deviation of the images' own tilts, radians; None without such
 
     @property
     def free_lens(self) -> BoolArray:
         """Lens parameters that were estimated, (5,)."""
-        return self.adjusted.adjuster.free.lens
+        return self.result.adjuster.free.lens
 
     @property
     def overdispersion(self) -> float:
-        """Of the errors that it leaves, at least that of the problem; see :class:`BundleAdjuster`."""
-        return self.adjusted.adjuster.overdispersion
+        """Overdispersion of the errors that it leaves, at least that of the problem; see :class:`BundleAdjuster`."""
+        return self.result.adjuster.overdispersion
 
     @property
     def bare(self) -> Self:
         """See :attr:`BundleAdjustmentResult.bare`."""
-        return replace(self, adjusted=self.adjusted.bare)
+        return replace(self, result=self.result.bare)
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class LinkProblem:
     camera_priors: CameraPriors
 
     def at(self, adjusted: BundleAdjustmentResult, free_lens: BoolArray) -> Self:
-        """The same from where an adjustment has put links and lens, with so much of the lens free."""
+        """The problem from where an adjustment has put links and lens, with so much of the lens free."""
         lens = adjusted.parameters.lens
         return replace(self, homographies=adjusted.homographies, lens=lens, free_lens=free_lens)
 
@@ -170,13 +171,13 @@ class Problem(LinkProblem):
         return self.observations.sigma(squared)
 
     def extend(self, fit: Fit, lens: BoolArray) -> Fit:
-        """The same model with more of the lens free."""
+        """Fit the same model with more of the lens free."""
         wider = replace(self, free_lens=self.free_lens | lens)
-        return wider.refine(fit.model, fit.adjusted.parameters, fit.tilt_spread)
+        return wider.refine(fit.model, fit.result.parameters, fit.tilt_spread)
 
     def adjuster_of(self, fit: Fit) -> BundleAdjuster:
-        """Of a fit, with the priors on it."""
-        return self.adjuster(fit.model, fit.tilt_spread, fit.adjusted.parameters.shared, fit.overdispersion)
+        """The adjuster of a fit, with the priors on it."""
+        return self.adjuster(fit.model, fit.tilt_spread, fit.result.parameters.shared, fit.overdispersion)
 
     def adjuster(
         self,
@@ -185,7 +186,7 @@ class Problem(LinkProblem):
         shared: FloatArray | None = None,
         overdispersion: float | None = None,
     ) -> BundleAdjuster:
-        """Of one model, with the priors on it; those of tilts as they show with the ``shared`` parameters."""
+        """The adjuster of one model with its priors; those of tilts as they show with the ``shared`` parameters."""
         tilt_spread = _TILT_SPREAD_START if tilt_spread is None else tilt_spread
         references = [self.reference] if self.camera_priors.fix_frame else []
         freedom = FreeParameters.fixing(model, self.count, references, self.free_lens)

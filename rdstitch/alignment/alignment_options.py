@@ -19,7 +19,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.places import contradicting_places
 from rdstitch.inputs.delays import DELAYS
 from rdstitch.matching.links import Link
-from rdstitch.robust.posterior import known_focal
+from rdstitch.robust.priors import known_focal
 
 FEWEST_MATCHES = 5
 """Of a link: through four points goes a homography, whichever they are."""
@@ -30,7 +30,7 @@ class AlignmentOptions:
     """What the caller decides, and what is given of the camera."""
 
     reference: int | None = None  # image that defines the plane's frame; None: the centre of the match graph
-    model: str = "auto"  # one of :data:`rdstitch.choices.ModelName`; "auto": the least free one that the data allow
+    model: ModelName = "auto"  # "auto": the least free one that the data allow
     lens_known: bool = False  # whether the lens is that of the cameras
     tilt: tuple[float, float] | None = None  # (ψ, θ), radians
     # (ψ, θ) of each image (N, 2), radians, by an IMU or a gimbal; ``tilt`` is then how the camera is mounted on that
@@ -42,7 +42,7 @@ class AlignmentOptions:
     positions: ArrayLike | None = None  # metres east and north (N, 2); NaN where unknown; a prior
     positions_std: ArrayLike | None = None  # standard deviation (N,) of one coordinate of these, m; NaN where unknown
     control: tuple[Sighting, ...] = ()  # ground control points in the images; a prior where there are three or more
-    lens: str = "auto"  # one of :data:`rdstitch.choices.LensName`; "auto": the simplest that the data allow
+    lens: LensName = "auto"  # "auto": the simplest that the data allow
     purpose: Purpose = Purpose.MOSAIC
     pose_covariance: bool = False  # its time grows with the square of the number of images
     # correspondences used of each link; fewer of thousands of links, more of the few of a turn on the spot
@@ -71,7 +71,7 @@ class AlignmentOptions:
         return [(psi, theta) for psi, theta in (attitudes + self.tilt).tolist()]
 
     def camera_priors(self, cameras: Sequence[Camera]) -> CameraPriors:
-        """As the adjustment needs it."""
+        """What is given of the cameras, as priors of the adjustment."""
         count = len(cameras)
         attitudes = _of_images("attitudes", self.attitudes, (count, 2), missing=0.0)
         delayed = self.delayed_attitudes
@@ -96,14 +96,12 @@ class AlignmentOptions:
         )
 
     @property
-    def lenses(self) -> list[str]:
-        """Lenses to be tried, from the simplest; none where the lens is given."""
-        if self.lens_known:
-            return []
+    def lenses(self) -> list[LensName]:
+        """Lenses to be tried, from the simplest."""
         return list(LENSES) if self.lens == "auto" else [self.lens]
 
     @property
-    def models(self) -> list[str]:
+    def models(self) -> list[ModelName]:
         """Models to be tried, from the least to the most free."""
         if self.model != "auto":
             return [self.model]

@@ -74,7 +74,7 @@ class AdjustedImages:
     @property
     def covariance_of_parameters(self) -> FloatArray:
         """(P, P)."""
-        return self.fit.adjusted.covariance if self.covariance is None else self.covariance
+        return self.fit.result.covariance if self.covariance is None else self.covariance
 
     @cached_property
     def estimated_lens_covariance(self) -> FloatArray:
@@ -93,8 +93,8 @@ class AdjustedImages:
 
     @cached_property
     def errors(self) -> FloatArray:
-        """Of all correspondences (M, 2), pixels, whitened: how far points are off, whatever moved them."""
-        observations, adjusted = replace(self.problem.observations, relief=None), self.fit.adjusted
+        """Errors of all correspondences (M, 2), pixels, whitened: how far points are off, whatever moved them."""
+        observations, adjusted = replace(self.problem.observations, relief=None), self.fit.result
         return whitened_errors(observations, adjusted.homographies, adjusted.parameters.lens)
 
     @cached_property
@@ -161,7 +161,7 @@ def build_alignment(adjusted: AdjustedImages) -> Alignment:
 
 def _adjusted_cameras(adjusted: AdjustedImages) -> tuple[Camera, ...]:
     """The camera of each image, with the lens, the focal length and the tilt that were found."""
-    model, shared = adjusted.fit.model, adjusted.fit.adjusted.parameters.shared
+    model, shared = adjusted.fit.model, adjusted.fit.result.parameters.shared
     std = np.sqrt(np.maximum(np.diag(adjusted.covariance_of_parameters), 0.0))
     tilt = tilt_std = None
     if model.has_metric_poses:
@@ -183,7 +183,7 @@ def _adjusted_cameras(adjusted: AdjustedImages) -> tuple[Camera, ...]:
 
 def _with_lens(adjusted: AdjustedImages, camera: Camera) -> Camera:
     """The camera of an image with the lens that was found."""
-    lens, covariance = adjusted.fit.adjusted.parameters.lens, adjusted.estimated_lens_covariance
+    lens, covariance = adjusted.fit.result.parameters.lens, adjusted.estimated_lens_covariance
     x, y = (np.asarray(camera.center) + lens[CENTER] * camera.scale).tolist()
     estimated = bool(covariance.any())
     result = replace(
@@ -193,7 +193,7 @@ def _with_lens(adjusted: AdjustedImages, camera: Camera) -> Camera:
     )
     if estimated and result.sees_beyond_horizon:
         raise ImpossibleCameraError(f"with λ = {result.distortion:.3g} the corners would see behind the camera")
-    converged = adjusted.fit.adjusted.converged or not adjusted.problem.free_lens.any()
+    converged = adjusted.fit.result.converged or not adjusted.problem.free_lens.any()
     shown = adjusted.lens.observable and converged
     std = _nearest_distortion_std(result, adjusted.considered_lens_covariance) if shown else math.inf
     return replace(result, distortion_std=std)
@@ -215,8 +215,8 @@ def _in_frame_of_reference(adjusted: AdjustedImages) -> tuple[FloatArray, Planar
     The adjustment may have held the reference image anywhere; here it comes to the origin, with yaw zero and, as
     the unit of length, height one.
     """
-    model, parameters, of_all = adjusted.fit.model, adjusted.fit.adjusted.parameters, adjusted.of_all
-    reference, matrices = adjusted.problem.reference, adjusted.fit.adjusted.matrices.matrices
+    model, parameters, of_all = adjusted.fit.model, adjusted.fit.result.parameters, adjusted.of_all
+    reference, matrices = adjusted.problem.reference, adjusted.fit.result.matrices.matrices
     if model.on_sphere:
         given = adjusted.given.options.gravity
         gravity = None if given is None else np.asarray(given, dtype=np.float64)[adjusted.images]
@@ -280,6 +280,6 @@ def _messages(adjusted: AdjustedImages, camera: Camera) -> tuple[Message, ...]:
         ratio = camera.focal / camera.scale / math.exp(known.log_focal)
         if abs(math.log(ratio)) >= math.log(_OVERRULED):
             result.append(focal_overruled(ratio))
-    if not fit.adjusted.converged:
+    if not fit.result.converged:
         result.append(not_converged(purpose))
     return (*result, *adjusted.messages)

@@ -16,16 +16,14 @@ from rdstitch.matching.links import grid_subsample
 
 _PROBES = 6  # points of a link that are transferred round each triangle
 
-_MAX_TRIANGLES, _TRIANGLES_PER_LINK = 20_000, 2
-"""Of all links together that are looked at: six of each link, in the mean, where there are many."""
-
+_MAX_TRIANGLES = 20_000  # triangles of all links that are looked at, or more where there are many links
+_TRIANGLES_PER_LINK = 2  # triangles a link then; each has three links, so that six are looked at of each
 _TRIANGLES_AT_ONCE = 4096
 
 _OUTLYING = 8.0  # times what is usual from which on a triangle does not close, and a link does not fit
 
-_VISIBLE, _MIN_VISIBLE = 1.5, 2
-"""Half diagonals from the middle up to which a transferred probe counts, and so many probes at least of a triangle."""
-
+_VISIBLE = 1.5  # half diagonals from the middle up to which a transferred probe counts
+_MIN_VISIBLE = 2  # such probes of a triangle at least
 _MIN_ERROR = 0.02  # half diagonals: a link that is off by less is no wrong pair
 
 

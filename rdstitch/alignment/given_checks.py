@@ -26,10 +26,11 @@ from rdstitch.alignment.sentences import (
 )
 from rdstitch.alignment.starts import start_from
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
+from rdstitch.choices import ModelName
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.delays import DELAY_STD, DELAYS, at_delay, smooth
 from rdstitch.results.messages import Message
-from rdstitch.robust.posterior import WRONG_GIVEN_FOCAL
+from rdstitch.robust.priors import WRONG_GIVEN_FOCAL
 
 _MAX_IMAGES = 60  # that are compared: evenly chosen ones of more say as well which signs are right
 _LOG_ODDS = math.log(1000.0)  # by how much the images must contradict what the user says
@@ -37,7 +38,7 @@ _SCATTERS = np.append(0.0, np.radians(np.geomspace(0.01, 45.0, 60)))  # standard
 _EXACT = math.radians(0.01)  # nothing is mounted more exactly
 _STRAINED = 2.0  # standard deviations of a given focal length by which it must have given way to be looked at again
 
-_WITH_TILTS = ["tilting"]
+_WITH_TILTS: list[ModelName] = ["tilting"]
 
 LATE = 3.0
 """Standard deviations from which on a delay is one."""
@@ -119,7 +120,7 @@ def is_strained(priors: CameraPriors, fit: Fit) -> bool:
     """Whether a focal length that the user gave gave way to the images by more than is likely."""
     if priors.focal_source not in ("option", "file") or not fit.model.has_metric_poses:
         return False
-    moved = float(fit.adjusted.parameters.shared[-1]) - priors.log_focal
+    moved = float(fit.result.parameters.shared[-1]) - priors.log_focal
     return abs(moved) > _STRAINED * priors.log_focal_std
 
 
@@ -128,7 +129,7 @@ def check_focal(given: Camera, fit: Fit, covariance: FloatArray | None) -> Messa
     if not fit.model.has_metric_poses or covariance is None or given.focal is None:
         return None
     place = fit.model.shared_names.index("log_focal")
-    focal, std = fit.model.focal(fit.adjusted.parameters.shared) * given.scale, math.sqrt(covariance[place, place])
+    focal, std = fit.model.focal(fit.result.parameters.shared) * given.scale, math.sqrt(covariance[place, place])
     _, contradicted = judged_focal(given.focal_log_std, math.log(focal / given.focal), std)
     return focal_contradicted(given.focal, focal, std) if contradicted else None
 
@@ -162,8 +163,8 @@ class _ShownTilts:
 
     @classmethod
     def of(cls, problem: Problem, fit: Fit, options: AlignmentOptions) -> "_ShownTilts":
-        """By a planar fit that knows nothing of the tilts; up to what all have in common where no tilt is given."""
-        adjuster, adjusted, model = problem.adjuster_of(fit), fit.adjusted, fit.model
+        """Take the tilts from a planar fit that knows nothing of them; up to what all share where no tilt is given."""
+        adjuster, adjusted, model = problem.adjuster_of(fit), fit.result, fit.model
         normal = adjuster.normal_equations(adjusted)
         tilts = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)[:, [PSI, THETA]]
         images = evenly_spaced(problem.count, _MAX_IMAGES)
@@ -184,7 +185,7 @@ class _ShownTilts:
         return cls(images, tilts[images], np.maximum(variances, 0.0), axes)
 
     def log_likelihood(self, expected: FloatArray, scatter: float) -> float:
-        """Of tilts (N, 2) that scatter by so much, radians, about those of the images."""
+        """Log-likelihood of tilts (N, 2) that scatter by so much, radians, about those of the images."""
         error = self.axes.T @ (self.tilts - expected[self.images]).ravel()
         variance = self.variances + scatter**2 + _EXACT**2
         return -0.5 * float((error**2 / variance + np.log(variance)).sum())
@@ -196,7 +197,7 @@ class _ShownTilts:
         return values[best], float(_SCATTERS[best])
 
     def delay(self, expected: FloatArray) -> tuple[float, float] | None:
-        """By how many seconds the times of tilts (N, S, 2) at :data:`DELAYS` are late, with its std, or None."""
+        """Delay of the times of tilts (N, S, 2) at :data:`DELAYS`, s, with its standard deviation; or None."""
         slow = smooth(expected)
         scores = (
             np.array([self.best_scatter(slow[:, k])[0] for k in range(len(DELAYS))]) - (DELAYS / DELAY_STD) ** 2 / 2

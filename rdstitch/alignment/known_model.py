@@ -11,13 +11,14 @@ from rdstitch.alignment.least_squares.bundle_adjustment import Parameters
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.select import ModelChoice
 from rdstitch.arrays import BoolArray, IntArray
+from rdstitch.choices import ModelName
 
 
 @dataclass(frozen=True, eq=False)
 class KnownModel:
     """The model that was chosen, and its solution."""
 
-    model: str
+    model: ModelName
     images: IntArray  # (N,): those aligned, of all images
     reference: int  # the one that fixes the gauge, of all images
     parameters: Parameters
@@ -27,11 +28,11 @@ class KnownModel:
 
     @classmethod
     def of(cls, draft: AdjustedImages) -> Self | None:
-        """That of a draft; None over relief, whose heights are found for each set of links."""
+        """The model of a draft; None over relief, whose heights are found for each set of links."""
         fit = draft.fit
         if draft.choice.over_relief:
             return None
-        reference, parameters = int(draft.images[draft.problem.reference]), fit.adjusted.parameters
+        reference, parameters = int(draft.images[draft.problem.reference]), fit.result.parameters
         others = draft.choice.others
         return cls(fit.model.name, draft.images, reference, parameters, fit.free_lens, fit.tilt_spread, others)
 

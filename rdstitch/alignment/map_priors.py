@@ -30,13 +30,12 @@ from rdstitch.robust.similarity_fit import OUTLYING, SimilarityFit, fit_similari
 POSITION_STD = 3.0
 """Metres: of one coordinate of a position by a receiver without corrections, within one flight."""
 
-_MIN_POSITIONS, _MIN_CONTROL, _MIN_SPREAD = 4, 3, 5.0
-"""Positions, and points, and standard deviations that they must be spread over, to say anything of the shape."""
-
+_MIN_POSITIONS = 4  # positions that say anything of the shape
+_MIN_CONTROL = 3  # control points that do
+_MIN_SPREAD = 5.0  # standard deviations of one that they must be spread over
 _CLICK = 0.5  # pixels: of a coordinate of where an image shows a control point
-_ROUNDS, _SETTLED = 8, 0.1
-"""Of fitting the similarity and adjusting again; standard deviations by which what is known still moves at the end."""
-
+_ROUNDS = 8  # rounds of fitting the similarity and adjusting again
+_SETTLED = 0.1  # standard deviations by which what is known still moves at the end
 _MAX_GROWTH = 1.1  # times by which the errors of the images may grow
 _SURE = 1.0 - 1e-6  # leverage beyond which rounding counts
 _MANY = 50  # positions whose leverage is computed; that of others is taken to be the median
@@ -55,7 +54,7 @@ class MapFit:
     leverage: Mapping[int | str, float] = field(default_factory=dict)  # by image of the problem, and name of a point
 
     def leverage_of(self, images: IntArray) -> dict[int | str, float]:
-        """The same by what those of the problem are among all images (N,)."""
+        """The leverage by the numbers that images of the problem have among all images (N,)."""
         return {key if isinstance(key, str) else int(images[key]): value for key, value in self.leverage.items()}
 
 
@@ -90,7 +89,7 @@ class _KnownPlaces(ABC):
 
     @abstractmethod
     def prior(self, priors: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
-        """With priors on the places: their means (N, 2) and inverse variances (N,)."""
+        """Priors with those on the places: their means (N, 2) and inverse variances (N,)."""
 
     @abstractmethod
     def jacobians(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -128,7 +127,7 @@ class _Positions(_KnownPlaces):
         self.labels, self.item = np.flatnonzero(self.known).tolist(), np.arange(len(self.metres))
 
     def estimated(self, fit: Fit) -> ComplexArray:
-        places: ComplexArray = fit.adjusted.parameters.poses[self.known][:, [X, Y]] @ _COMPLEX
+        places: ComplexArray = fit.result.parameters.poses[self.known][:, [X, Y]] @ _COMPLEX
         return places
 
     def prior(self, priors: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
@@ -174,17 +173,17 @@ class _Control(_KnownPlaces):
         return replace(priors, marks=PlaneMarks(shown.image, shown.points, target[shown.point], shared))
 
     def jacobians(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
-        parameters, marks = fit.adjusted.parameters, adjuster.priors.marks
+        parameters, marks = fit.result.parameters, adjuster.priors.marks
         assert marks is not None
         focal = fit.model.focal(parameters.shared)
-        derivative = marks.equations(fit.adjusted.matrices, parameters.lens, adjuster.free.lens, focal)[1]
+        derivative = marks.equations(fit.result.matrices, parameters.lens, adjuster.free.lens, focal)[1]
         return marks.image, derivative, marks.precision
 
 
 def _sightings(control: ControlPoints, fit: Fit) -> FloatArray:
     """Where a fit has each sighting of control points, (M, 2); not finite where no place looks like that."""
     adjusted, marks = (
-        fit.adjusted,
+        fit.result,
         PlaneMarks(control.image, control.points, control.points, np.zeros(len(control.image))),
     )
     focal = fit.model.focal(adjusted.parameters.shared)
@@ -201,14 +200,14 @@ def _adjusted(problem: Problem, fit: Fit, known: list[_KnownPlaces]) -> MapFit:
             priors, similarity, excess = places.prior_from_map(priors, refined)
             on_map.append((similarity, excess))
         with_map = replace(problem, camera_priors=priors)
-        refined = with_map.refine(fit.model, refined.adjusted.parameters, fit.tilt_spread)
+        refined = with_map.refine(fit.model, refined.result.parameters, fit.tilt_spread)
         moved = [
             np.abs(places.estimated(refined) - former).max() * abs(similarity.scale) / (np.median(places.std) * excess)
             for places, former, (similarity, excess) in zip(known, before, on_map, strict=True)
         ]
         if max(moved) < _SETTLED:
             break
-    growth = math.hypot(refined.adjusted.sigma, MODEL_ERROR) / math.hypot(fit.adjusted.sigma, MODEL_ERROR)
+    growth = math.hypot(refined.result.sigma, MODEL_ERROR) / math.hypot(fit.result.sigma, MODEL_ERROR)
     distance = float(np.median(on_map[0][0].residuals))
     far = isinstance(known[0], _Positions) and distance > OUTLYING * max(float(np.median(known[0].std)), POSITION_STD)
     if far or growth > _MAX_GROWTH:
@@ -220,7 +219,7 @@ def _adjusted(problem: Problem, fit: Fit, known: list[_KnownPlaces]) -> MapFit:
 def _leverage(problem: Problem, fit: Fit, known: Sequence[_KnownPlaces]) -> dict[int | str, float]:
     """How far (0 to 1) what is known puts itself where the fit has it; by the label of each."""
     adjuster = problem.adjuster_of(fit)
-    normal, (count, size) = adjuster.normal_equations(fit.adjusted), adjuster.free.poses.shape
+    normal, (count, size) = adjuster.normal_equations(fit.result), adjuster.free.poses.shape
     leverage: dict[int | str, float] = {}
     for places in known:
         image, derivative, precision = places.jacobians(adjuster, fit)

@@ -14,7 +14,7 @@ from rdstitch.alignment.result import Alignment, PlanarPoses
 from rdstitch.alignment.uncertainty import pose_jacobian
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
-from rdstitch.robust.posterior import exact
+from rdstitch.robust.priors import exact
 
 
 def without_measurements(near_copies: Mapping[int, int], options: AlignmentOptions) -> dict[int, int]:
@@ -47,7 +47,7 @@ def with_near_copies(
     copies: BoolArray = ~np.isin(images, aligned)
     rows, reference = images[copies], int(number[alignment.reference])
 
-    model, start, camera_priors = fit.model, fit.adjusted.parameters, all_links.camera_priors.of(images)
+    model, start, camera_priors = fit.model, fit.result.parameters, all_links.camera_priors.of(images)
     where = np.searchsorted(aligned, firsts)
     poses = start.poses[where]
     tilted = camera_priors.attitudes - camera_priors.attitudes[number[firsts]]
@@ -82,10 +82,10 @@ def with_near_copies(
 
 def _tilted(fit: Fit, rows: IntArray, by: FloatArray) -> FloatArray:
     """The poses that come nearest to those of a fit in some rows, and are tilted by so much (C, 2) more, radians."""
-    model, parameters = fit.model, fit.adjusted.parameters
+    model, parameters = fit.model, fit.result.parameters
     poses = parameters.poses[rows]
     if not model.has_metric_poses:
         return poses
     tilts = model.metric_poses(poses, parameters.shared)[:, [PSI, THETA]] + by
     tilts -= model.physical_parameters(parameters.shared)[0][:2]
-    return model.nearest_poses(fit.adjusted.matrices.matrices[rows], parameters.shared, tilts)
+    return model.nearest_poses(fit.result.matrices.matrices[rows], parameters.shared, tilts)

@@ -24,7 +24,8 @@ from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 _EXACT = 1e-6  # of the longest step: no odometry is more exact, whatever it states
 _WHEELS = 0.01  # relative standard deviation of what all distances share: the size of the wheels
 _LEVER = 0.5  # units of the odometry: how far from the body's origin cameras are
-_ROUNDS, _HUBER = 5, 2.0  # wheels slip
+_ROUNDS = 5  # rounds of reweighting, as wheels slip
+_HUBER = 2.0  # standard deviations beyond which a step counts less
 _MIN_STEPS = 3
 
 
@@ -48,7 +49,7 @@ class OdometryFit:
 
     @classmethod
     def of(cls, motions: Sequence[Motion]) -> "OdometryFit | None":
-        """From motions between frames; None where they are too few, or none goes anywhere."""
+        """Fit motions between frames; None where they are too few, or none goes anywhere."""
         if len(motions) < _MIN_STEPS:
             return None
         body, camera, turn, variance = (np.array(column) for column in zip(*motions, strict=True))

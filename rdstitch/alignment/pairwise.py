@@ -23,7 +23,8 @@ from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost, sigma_of
 from rdstitch.solvers.homography import direct_linear
 
 _MAX_ITERATIONS = 24  # a start need not be the minimum
-_TRIAL_LINKS, _TRIAL_MATCHES = 30, 40  # what the shared parameters to start from are tried on
+_TRIAL_LINKS = 30  # links that the shared parameters to start from are tried on
+_TRIAL_MATCHES = 40  # matches of each of them
 
 
 def relations_at(observations: Observations, relations: Sequence[RadialHomography], lens: FloatArray) -> FloatArray:
@@ -76,7 +77,7 @@ def pairwise_homographies(links: LinkProblem) -> BundleAdjustmentResult:
 
 
 def best_trial(links: LinkProblem, model: MotionModel) -> tuple[BundleAdjuster, Parameters]:
-    """Of a few links on their own, from the shared parameters that come nearest to them without adjustment."""
+    """The adjuster of a few links on their own, from the shared parameters nearest to them without adjustment."""
     priors, few = links.camera_priors, evenly_spaced(len(links.observations), _TRIAL_LINKS)
     sample = links.observations.subset(few).thinned(_TRIAL_MATCHES)
     trial = LinkProblem(sample, links.homographies[few], links.lens, links.free_lens, priors)

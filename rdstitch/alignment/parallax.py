@@ -18,10 +18,10 @@ _ASIDE = 0.3  # half diagonals from the middle of an image, where its size on th
 
 @dataclass(frozen=True)
 class Parallax:
-    """Of the images of an adjustment, by this adjuster or one with other weights."""
+    """Parallax of the images of an adjustment, by this adjuster or one with other weights."""
 
     adjuster: BundleAdjuster
-    adjusted: BundleAdjustmentResult
+    result: BundleAdjustmentResult
 
     @np.errstate(all="ignore")  # what lies beyond a horizon has no place
     def of(self, part: LinearizedErrors) -> tuple[FloatArray, FloatArray]:
@@ -29,7 +29,7 @@ class Parallax:
 
         The unit does not matter, since how high the ground is shows in the errors.
         """
-        o, lens = self.adjuster.observations, self.adjusted.parameters.lens
+        o, lens = self.adjuster.observations, self.result.parameters.lens
         link = o.link[part.rows]
         distortion, higher, centre = split_lens(lens)
         flat = undistort(o.points1[part.rows] - centre, distortion, higher)
@@ -46,7 +46,7 @@ class Parallax:
 
     @cached_property
     def size(self) -> float:
-        """Of half a diagonal of most images on the plane, or between directions."""
+        """Size of half a diagonal of most images on the plane, or between directions."""
         return float(np.median(self._sizes))
 
     def from_middle(self, place: FloatArray) -> FloatArray:
@@ -59,7 +59,7 @@ class Parallax:
     @cached_property
     def _back(self) -> FloatArray:
         """Image-to-plane homographies, or those to directions, (N, 3, 3)."""
-        return inverses(self.adjusted.matrices.matrices)
+        return inverses(self.result.matrices.matrices)
 
     def _places(self, lifted: FloatArray) -> FloatArray:
         """Places (m, 2) on the plane, or directions (m, 3), of homogeneous ones (m, 3)."""
@@ -75,7 +75,7 @@ class Parallax:
 
     @cached_property
     def _sizes(self) -> FloatArray:
-        """Of half a diagonal of each image on the plane, or between directions, (N,)."""
+        """Sizes (N,) of half a diagonal of each image on the plane, or between directions."""
         aside = [self._places(self._back @ np.array([x, y, 1.0])) for x, y in ((_ASIDE, 0.0), (0.0, _ASIDE))]
         away = [np.linalg.norm(places - self._centres, axis=1) / _ASIDE for places in aside]
         sizes: FloatArray = np.maximum((away[0] + away[1]) / 2.0, 1e-12)
@@ -84,7 +84,7 @@ class Parallax:
     @cached_property
     def _nadirs(self) -> tuple[FloatArray, FloatArray]:
         """What each camera is above (N, 2), and how high it is (N,); roughly, in some unit, without poses."""
-        model, parameters = self.adjuster.model, self.adjusted.parameters
+        model, parameters = self.adjuster.model, self.result.parameters
         if not model.has_metric_poses:
             return self._centres, self._sizes
         poses = model.metric_poses(parameters.poses, parameters.shared)
@@ -92,15 +92,15 @@ class Parallax:
 
     @cached_property
     def _shifts(self) -> FloatArray:
-        """Of the camera away from where it turns, one an image, (N, 2): any, since nothing is known of them."""
+        """Shifts (N, 2) of the camera away from where it turns, one an image: any, since nothing is known of them."""
         return np.random.default_rng(0).normal(size=(len(self._back), 2))
 
     def _moved(self, place: FloatArray, images: IntArray) -> FloatArray:
-        """By how much measured points (m, 2) of places move in their images (m,) with the height of the ground."""
+        """Motion (m, 2) of measured points of places in their images (m,) with the height of the ground."""
         if self.is_turn:
             shift: FloatArray = self._shifts[images]
             return shift
-        lens, matrices = self.adjusted.parameters.lens, self.adjusted.matrices.matrices[images]
+        lens, matrices = self.result.parameters.lens, self.result.matrices.matrices[images]
         distortion, higher, _ = split_lens(lens)
         nadirs, heights = self._nadirs
         away = (place - nadirs[images]) / heights[images, None]

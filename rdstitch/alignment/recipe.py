@@ -33,14 +33,10 @@ from rdstitch.matching.links import Link, in_alternate_directions
 from rdstitch.results.messages import Message
 from rdstitch.robust.chance import occupied_cells
 
-# Side of an image, beside that of the largest, below which it was reduced, and must not set the scale of the output.
-_REDUCED = 0.8
-_MATCHES_OF_A_TURN = 5000
-"""Correspondences of all links together that the final adjustment of a turn on the spot uses at least, if there are."""
-
-_MATCHES_OF_ALL, _MATCHES_OF_A_LINK = 500_000, 40
-"""Correspondences of all links together that are enough, and of a link that are used nevertheless."""
-
+_REDUCED = 0.8  # side over that of the largest image, below which one was reduced and must not set the output's scale
+_MATCHES_OF_A_TURN = 5000  # correspondences of all links that the final adjustment of a pure rotation uses at least
+_MATCHES_OF_ALL = 500_000  # correspondences of all links together that are enough
+_MATCHES_OF_A_LINK = 40  # correspondences of a link that are used nevertheless
 _MATCHES_FOR_SELECTION = 5_000  # correspondences of all links together that a model is chosen by
 # Half diagonals. Matches at random leave 0.2 (eight of them) to 0.8, whichever model is adjusted to them (72 times).
 _MAX_RMS = 0.1
@@ -178,7 +174,7 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
     problem = replace(problem, overdispersion=max(shared, choice.fit.overdispersion))
     problem, fit = adjust_over_relief(problem, choice)
     fit = from_another_start(problem, fit)
-    if len(options.lenses) > 1:
+    if options.lens == "auto":
         problem, fit = with_third_coefficient(problem, fit)
     on_map = adjust_to_map(problem, fit)
     problem, fit = on_map.problem, on_map.fit
@@ -198,9 +194,9 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
 
 def from_another_start(problem: Problem, fit: Fit) -> Fit:
     """A fit that converged as it is; another one from where the links lead, where that converges or fits better."""
-    if fit.adjusted.converged:
+    if fit.result.converged:
         return fit
-    return min((fit, fit_model(problem, fit.model)), key=lambda one: (not one.adjusted.converged, one.adjusted.sigma))
+    return min((fit, fit_model(problem, fit.model)), key=lambda one: (not one.result.converged, one.result.sigma))
 
 
 def _with_checked_focal(adjusted: AdjustedImages, stated: AlignmentOptions) -> Alignment:
@@ -208,7 +204,7 @@ def _with_checked_focal(adjusted: AdjustedImages, stated: AlignmentOptions) -> A
     if adjusted.covariance is None or not is_strained(adjusted.all_links.camera_priors, adjusted.choice.fit):
         return build_alignment(adjusted)
     given = adjusted.given
-    cameras = [camera.without_focal().with_focal() for camera in given.cameras]
+    cameras = [camera.without_focal().with_guessed_focal() for camera in given.cameras]
     # A tilt that was given as wrong as the focal length would speak for it, and against a right one.
     only_tilt = given.options.attitudes is None and given.options.tilt is not None
     options = replace(given.options, tilt=None) if only_tilt else given.options
@@ -242,7 +238,7 @@ def _matches_of_a_link(links: int, options: AlignmentOptions) -> int:
 def _observations(
     links: Sequence[Link], cameras: Sequence[Camera], max_matches: int
 ) -> tuple[Observations, list[RadialHomography]]:
-    """Of each link at most so many correspondences, chosen before any is turned round; and how each maps them."""
+    """At most so many correspondences of each link, chosen before any is turned round; and how each maps them."""
     read = in_alternate_directions([link.thinned(max_matches) for link in links])
     return Observations.from_links(read, cameras), [link.relation for link in read]
 
@@ -278,7 +274,7 @@ def _drop_wrong_pairs(
     as_given, all_links = all_links.free_lens, replace(all_links, free_lens=choice.fit.free_lens)
     o = all_links.observations
     for _ in range(_ROUNDS):
-        adjusted, model = choice.fit.adjusted, choice.fit.model
+        adjusted, model = choice.fit.result, choice.fit.model
         between_images, _ = all_links.part(np.ones_like(wrong), images)
         inside = np.isin(o.image1, images) & np.isin(o.image2, images)
         squared = between_images.adjuster(model).squared(adjusted.parameters)

@@ -19,9 +19,8 @@ from rdstitch.alignment.noise import neighbours
 from rdstitch.alignment.parallax import Parallax
 from rdstitch.arrays import FloatArray, IntArray
 
-_SHORTEST, _LONGEST = 0.5, 6.0
-"""Wavelengths, in half diagonals of an image on the ground: what neighbours show, and what poses absorb whole."""
-
+_SHORTEST = 0.5  # half diagonals of an image on the ground: the shortest wavelength that neighbours show
+_LONGEST = 6.0  # the same: a wavelength that poses absorb whole
 _WAVES = 32  # waves, each as a sine and a cosine
 _BANDS = 4  # of waves that are answered together
 
@@ -30,8 +29,8 @@ _NOISE_FIELDS = 16
 
 _CURVATURES = 3  # of a plane: along x, aslant, and along y
 
-_UNSEEN, _NEWTON_STEPS = 1e-9, 50
-"""Share of the largest information that none is; steps to the variance of curvatures at most."""
+_UNSEEN = 1e-9  # information, over the largest, that is none
+_NEWTON_STEPS = 50  # steps to the variance of curvatures at most
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class ReliefField:
         return np.concatenate(poses, axis=-1), np.concatenate(shared, axis=-1)
 
     def _steps_by_waves(self, agreement: float) -> tuple[FloatArray, FloatArray]:
-        """By relief as steep as leaves the agreement of errors that was found, px²."""
+        """Steps by relief as steep as leaves the agreement of errors that was found, px²."""
         step = _WAVES // _BANDS
         responses = [self._response_to(self._waves(start, step), 2 * step) for start in range(0, _WAVES, step)]
         left = float(np.mean([left for left, *_ in responses]))
@@ -61,7 +60,7 @@ class ReliefField:
         return poses * scale, shared * scale
 
     def _steps_by_curvature(self) -> tuple[FloatArray, FloatArray]:
-        """By a plane that is curved alike everywhere, as a wall may be: what pairs absorb of it does not cancel out.
+        """Steps by a plane that is curved alike everywhere, as a wall may be: what pairs absorb of it does not cancel.
 
         How much curvature there is shows what they do not absorb of it, beyond noise; of one pair next to nothing.
         """
@@ -141,12 +140,12 @@ class ReliefField:
 
     @cached_property
     def _parallax(self) -> Parallax:
-        return Parallax(self.response.adjuster, self.response.adjusted)
+        return Parallax(self.response.adjuster, self.response.result)
 
     @cached_property
     def _pairs(self) -> IntArray:
         """Inliers and neighbours of theirs in the same link, (2, P), by the first of each pair."""
-        pairs = neighbours(self.response.adjuster.observations, self.response.adjusted.inliers)
+        pairs = neighbours(self.response.adjuster.observations, self.response.result.inliers)
         nearest: IntArray = np.unique(np.sort(np.stack(pairs), axis=0), axis=1)
         return nearest
 
@@ -177,7 +176,7 @@ def _independent(part: LinearizedErrors) -> FloatArray:
 
 
 def _wave_vectors(in_space: bool) -> FloatArray:
-    """Of :data:`_WAVES` waves, (W, 2 or 3), in all directions; wavelengths are spread evenly in their logarithm."""
+    """Vectors of :data:`_WAVES` waves (W, 2 or 3) in all directions; wavelengths are even in their logarithm."""
     number = np.arange(_WAVES)
     length = _SHORTEST * (_LONGEST / _SHORTEST) ** ((number + 0.5) / _WAVES)
     # Directions by an additive recurrence, which is even at all lengths (Roberts 2018).

@@ -21,30 +21,32 @@ from rdstitch.alignment.parallax import Parallax
 from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.alignment.starts import fit_model, start_from
 from rdstitch.arrays import FloatArray
-from rdstitch.choices import Purpose
+from rdstitch.choices import ModelName, Purpose
 from rdstitch.robust.loss import NORMAL_MEDIAN
 
 _MIN_IMAGES = 3  # images: of two, tilts do what heights do, and the errors do not show which
 
-_ROUNDS, _SETTLED = 4, 0.02
-"""Of finding the scatter of the heights and adjusting again, and by how much it still changes at the end: at first the
-camera has followed the hills, so that it is found too small."""
+_ROUNDS = 4
+"""Rounds of finding the scatter of the heights and adjusting again: at first the camera has followed the hills, so that
+it is found too small."""
 
-_SQUARE_MEDIAN, _MEDIAN_STD = NORMAL_MEDIAN**2, 2.333
-"""Median of the square of a normal variable of variance 1; the standard deviation of the median of N such squares, in
-medians and times the root of N."""
+_SETTLED = 0.02  # relative change of that scatter that is none
+_SQUARE_MEDIAN = NORMAL_MEDIAN**2  # median of the square of a normal variable of variance 1
+_MEDIAN_STD = 2.333  # standard deviation of the median of N such squares, in medians and times the root of N
 
 _SIGNIFICANT = 3.0
 """Standard deviations of the logarithm of their ratio by which errors along the parallax must exceed those across."""
 
 
-def choose_over_relief(problem: Problem, choice: ModelChoice, names: Sequence[str], purpose: Purpose) -> ModelChoice:
+def choose_over_relief(
+    problem: Problem, choice: ModelChoice, names: Sequence[ModelName], purpose: Purpose
+) -> ModelChoice:
     """The model of one camera chosen again, with heights that account for errors, where such heights show.
 
     Freeing the distortion centre is not tried: over relief it bends the whole as the ground bends the images.
     """
     # Where neighbours hardly agree, errors along the parallax are none of the ground: blobs have them, seen obliquely.
-    if not shows_relief(residual_coherence(choice.fit.adjusted)) or weighted_by_relief(problem, choice.fit) is None:
+    if not shows_relief(residual_coherence(choice.fit.result)) or weighted_by_relief(problem, choice.fit) is None:
         return choice
     problem = replace(problem, overdispersion=choice.fit.overdispersion)
     fits: list[Fit] = []
@@ -76,7 +78,7 @@ def weighted_by_relief(problem: Problem, fit: Fit) -> Problem | None:
     if not fit.model.has_metric_poses or problem.count < _MIN_IMAGES:
         return None
     plain = replace(problem, observations=replace(problem.observations, relief=None))
-    adjuster, adjusted, o = plain.adjuster_of(fit), fit.adjusted, plain.observations
+    adjuster, adjusted, o = plain.adjuster_of(fit), fit.result, plain.observations
     field = Parallax(adjuster, adjusted)
     errors, parallax, moved = (np.zeros_like(o.points1) for _ in range(3))
     for part in linearized_errors(o, adjusted.homographies, adjusted.parameters.lens, adjuster.free.lens):
@@ -105,7 +107,7 @@ def _settled(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
 
 
 def _refined(problem: Problem, fit: Fit) -> Fit:
-    return problem.refine(fit.model, fit.adjusted.parameters, fit.tilt_spread)
+    return problem.refine(fit.model, fit.result.parameters, fit.tilt_spread)
 
 
 def _scatter(errors: FloatArray, parallax: FloatArray, effective: float) -> float:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rdstitch.alignment.motion_models import LOG_HEIGHT, MODELS, PSI, THETA, YAW, X, Y
 from rdstitch.arrays import FloatArray, Rows
+from rdstitch.choices import LensName, ModelName
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rigid_in_plane
 from rdstitch.geometry.radial_homography import from_plane, to_plane
@@ -64,7 +65,7 @@ class PlanarPoses(Rows):
 
     @classmethod
     def of(cls, metric: FloatArray) -> Self:
-        """Of poses (N, 6) in metric units, in the columns of the planar models; no covariances."""
+        """Convert poses (N, 6) in metric units, in the columns of the planar models; without covariances."""
         return cls(metric[:, YAW], metric[:, [X, Y]], np.exp(metric[:, LOG_HEIGHT]), metric[:, [PSI, THETA]])
 
     def relative_to(self, reference: int) -> "PlanarPoses":
@@ -148,12 +149,12 @@ class Alignment:
     used: NDArray[np.bool_]
     components: tuple[tuple[int, ...], ...]
     reference: int
-    model: str
+    model: ModelName
     model_reason: str
     rms: float
     links: tuple[LinkFit, ...]
     relief: ReliefTest
-    lens: str = "division"
+    lens: LensName = "division"
     lens_reason: str = "one parameter"
     poses: PlanarPoses | None = None
     tilt_spread: float = 0.0
@@ -169,11 +170,11 @@ class Alignment:
         return f"<Alignment {used} of {count} images, {self.model}, rms {self.rms:.2f} pixels>"
 
     def with_messages(self, messages: Iterable[Message]) -> Self:
-        """The same with more to know about it."""
+        """The alignment with further messages."""
         return replace(self, messages=(*self.messages, *messages))
 
     def with_copies(self, copies: Mapping[int, int], pairs: Sequence[tuple[int, int]]) -> Self:
-        """The same with copies, by index, where the images lie that they are copies of.
+        """The alignment with copies, by index, where the images lie that they are copies of.
 
         The links are between the images of these pairs, one of which may be a copy.
         """

@@ -1,6 +1,6 @@
-"""Which motion the images show: one posterior score for all hypotheses.
+"""Which motion the images show: one posterior cost for all hypotheses.
 
-The score is that of :mod:`rdstitch.robust.posterior`; a layout that nobody would keep has none.
+The cost is that of :mod:`rdstitch.robust.posterior`; a layout that nobody would keep has none.
 
 A camera that stays where it is sees the same of a plane as of anything else: where a turn explains the images, models
 over a plane do so too, with more parameters, so that the turn is taken where it fits, and a plane where there is
@@ -24,8 +24,9 @@ from rdstitch.alignment.noise import evidence_of
 from rdstitch.alignment.pairwise import fit_pairwise
 from rdstitch.alignment.starts import fit_model
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.choices import Purpose
-from rdstitch.robust.posterior import TWENTY_TO_ONE, Evidence
+from rdstitch.choices import ModelName, Purpose
+from rdstitch.robust.posterior import Evidence
+from rdstitch.robust.priors import TWENTY_TO_ONE
 
 _MIN_RATIO = 3.0
 """Times by which the errors of one camera must exceed those of free homographies, one an image, where numbers are
@@ -50,17 +51,17 @@ class ModelChoice:
     @property
     def reason(self) -> str:
         """One sentence."""
-        model, adjusted = self.fit.model, self.fit.adjusted
+        model, adjusted = self.fit.model, self.fit.result
         described = model.description(adjusted.parameters.poses, adjusted.parameters.shared)
         return f"{model.name}: {described}; most matches fit to {adjusted.sigma:.2f} pixels{self.others}"
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A fit with its posterior score."""
+    """A fit with its posterior cost."""
 
     fit: Fit
-    score: float  # -2 log of the posterior, up to a constant of the problem
+    cost: float  # -2 log of the posterior, up to a constant of the problem
     field: float  # size of what the errors of neighbours share, pixels of a coordinate
     stretch: float  # of its layout: the ratio of areas, inf where images are folded; 1 where it is not asked for
 
@@ -97,34 +98,34 @@ class Posterior:
         """Shared errors, pixels of a coordinate, that local alignment and seams can hide."""
         return math.hypot(_TOLERABLE * float(self.evidence.farthest[0]), float(self.evidence.noise[0]))
 
-    def scored(self, fit: Fit) -> Hypothesis:
-        """Score a fit."""
+    def hypothesis(self, fit: Fit) -> Hypothesis:
+        """The hypothesis of a fit."""
         # Of any model what its errors show, whatever its freedom costs: it is held against what seams can hide.
-        field = float(self.evidence.field(fit.adjusted.errors)[0])
+        field = float(self.evidence.field(fit.result.errors)[0])
         layout = stretch(fit) if self.purpose.picture else 1.0
         spread = (fit.tilt_spread or 0.0) / _TYPICAL_TILT_SPREAD
         wide = 4.0 * self.problem.count * math.log(max(spread, 1.0))
-        priors = self.problem.adjuster_of(fit).camera_prior_cost(fit.adjusted.parameters)
-        score = self.lower_bound(fit.model, fit.adjusted.errors, fit.free_lens) + wide + priors
-        return Hypothesis(fit, score, field, layout)
+        priors = self.problem.adjuster_of(fit).camera_prior_cost(fit.result.parameters)
+        cost = self.lower_bound(fit.model, fit.result.errors, fit.free_lens) + wide + priors
+        return Hypothesis(fit, cost, field, layout)
 
     def lower_bound(self, model: MotionModel, errors: FloatArray, free_lens: BoolArray | None = None) -> float:
-        """The score of a model that leaves such errors (M, 2), of a camera that is as cameras are."""
+        """The cost of a model that leaves such errors (M, 2), of a camera that is as cameras are."""
         free = parameter_count(self.problem, model, self.problem.free_lens if free_lens is None else free_lens)
         preference = TWENTY_TO_ONE if model.on_sphere != (self.purpose is Purpose.PANO) else 0.0
-        return float(self.evidence.score(errors, free, preference)[0])
+        return float(self.evidence.cost(errors, free, preference)[0])
 
     def suffices(self, best: Hypothesis, model: MotionModel) -> bool:
         """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""
         if not model.one_camera and not _is_beyond_one_camera(self, best, self.least_field):
             return True
-        return not best.implausible and best.score <= self.lower_bound(model, self.link_errors)
+        return not best.implausible and best.cost <= self.lower_bound(model, self.link_errors)
 
 
 def select_model(
-    problem: Problem, names: Sequence[str], lenses: Sequence[BoolArray] = (), purpose: Purpose = Purpose.MOSAIC
+    problem: Problem, names: Sequence[ModelName], lenses: Sequence[BoolArray] = (), purpose: Purpose = Purpose.MOSAIC
 ) -> ModelChoice:
-    """Adjust hypotheses from the least to the most free, and take the one with the best score.
+    """Adjust hypotheses from the least to the most free, and take the one with the least cost.
 
     Models are no longer tried that could not pay for their freedom even with the errors that links leave on their own;
     nor is a turn that could not with those of links that are turns on their own.
@@ -137,19 +138,19 @@ def select_model(
     wide = replace(problem, free_lens=np.logical_or.reduce([problem.free_lens, *lenses]))
     turns = [_TurnTrial.of(posterior, wide, model) for model in models if model.on_sphere]
     bar = posterior.lower_bound(planar[0], posterior.link_errors) if planar else math.inf
-    early = [turn.scored(posterior) for turn in turns if turn.bound < bar]
+    early = [turn.hypothesis(posterior) for turn in turns if turn.bound < bar]
     tried = _with_planar(posterior, early, planar, free=not all(model.one_camera for model in models))
     for turn in (turn for turn in turns if turn.bound >= bar):
-        best = min((one for one in tried if one.fit.model.one_camera), key=_score)
-        if best.implausible or turn.bound < best.score:
-            tried.insert(0, turn.scored(posterior))
+        best = min((one for one in tried if one.fit.model.one_camera), key=_cost)
+        if best.implausible or turn.bound < best.cost:
+            tried.insert(0, turn.hypothesis(posterior))
     tried = _with_wider_lenses(posterior, tried, lenses)
     return _choice(tried, _best(posterior, tried), requested=len(names) == 1)
 
 
 @dataclass(frozen=True, eq=False)
 class _TurnTrial:
-    """What links that are turns on their own say of a turn of all images: no score of it is less than the bound."""
+    """What links that are turns on their own say of a turn of all images: its cost is no less than the bound."""
 
     model: MotionModel
     bound: float
@@ -162,29 +163,29 @@ class _TurnTrial:
         pairs, shared = fit_pairwise(problem, model)
         return cls(model, posterior.lower_bound(model, pairs.errors), shared)
 
-    def scored(self, posterior: Posterior) -> Hypothesis:
-        return posterior.scored(fit_model(posterior.problem, self.model, shared=self.shared))
+    def hypothesis(self, posterior: Posterior) -> Hypothesis:
+        return posterior.hypothesis(fit_model(posterior.problem, self.model, shared=self.shared))
 
 
 def _with_planar(
     posterior: Posterior, tried: Sequence[Hypothesis], models: Sequence[MotionModel], *, free: bool
 ) -> list[Hypothesis]:
-    """With planar models, from the least to the most free, which are ``free`` homographies or not."""
+    """Try planar models, from the least to the most free, which are ``free`` homographies or not."""
     tried = list(tried)
     for model in models:
         if posterior.problem.count == 2 and model.free_tilts and free:
             continue  # with two images, one camera that tilts is a homography
-        if tried and posterior.suffices(min(tried, key=_score), model):
+        if tried and posterior.suffices(min(tried, key=_cost), model):
             break
         planes = [one.fit for one in tried if not one.fit.model.on_sphere]
-        tried.append(posterior.scored(fit_model(posterior.problem, model, planes[-1:])))
+        tried.append(posterior.hypothesis(fit_model(posterior.problem, model, planes[-1:])))
     return tried
 
 
 def best_of(problem: Problem, fits: Sequence[Fit], purpose: Purpose, *, requested: bool) -> ModelChoice | None:
     """Take the best of some fits of the problem; None where nobody would keep the layout of any."""
     posterior = Posterior(problem, purpose)
-    tried = [posterior.scored(fit) for fit in fits]
+    tried = [posterior.hypothesis(fit) for fit in fits]
     tried = [one for one in tried if not one.implausible]
     return _choice(tried, _best(posterior, tried), requested=requested) if tried else None
 
@@ -195,38 +196,38 @@ def _with_wider_lenses(
     """Free more of the lens where that pays."""
     tried = list(tried)
     for lens in lenses:
-        order = sorted(range(len(tried)), key=lambda index: tried[index].score)[:2]
+        order = sorted(range(len(tried)), key=lambda index: tried[index].cost)[:2]
         for index in sorted({0, *order}):
             fit = tried[index].fit
-            wider = posterior.scored(posterior.problem.extend(fit, lens | fit.free_lens))
+            wider = posterior.hypothesis(posterior.problem.extend(fit, lens | fit.free_lens))
             # A centre that is off bends a plane as rough ground bends the images; directions it does not bend.
-            shown = fit.model.on_sphere or residual_coherence(wider.fit.adjusted).correlation < NO_COHERENCE
-            if wider.score < tried[index].score and shown:
+            shown = fit.model.on_sphere or residual_coherence(wider.fit.result).correlation < NO_COHERENCE
+            if wider.cost < tried[index].cost and shown:
                 tried[index] = wider
     return tried
 
 
 def _best(posterior: Posterior, tried: Sequence[Hypothesis]) -> Hypothesis:
-    """The one with the best score; free homographies only of what one camera does not explain.
+    """The one with the least cost; free homographies only of what one camera does not explain.
 
     Where a plane that nobody would lay out explains the images, so do free homographies: a turn whose errors seams can
     hide is taken instead; so it is of a picture where homographies are hardly more probable.
     """
     cameras = [one for one in tried if one.fit.model.one_camera] or tried
-    best = min(cameras, key=_score)
+    best = min(cameras, key=_cost)
     free = [one for one in tried if not one.fit.model.one_camera]
-    chosen = min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_score)
+    chosen = min([best, *(one for one in free if _is_beyond_one_camera(posterior, best, one.field))], key=_cost)
     hidden = [one for one in tried if one.field < posterior.tolerable and not one.implausible]
     turns, kept = [one for one in hidden if one.fit.model.on_sphere], list[Hypothesis]()
     if best.implausible:
         kept = turns or (hidden if math.isinf(best.stretch) else [])
     elif posterior.purpose.picture and not chosen.fit.model.one_camera:
-        kept = [one for one in turns if one.score < chosen.score + TWENTY_TO_ONE]
-    return min(kept, key=_score, default=chosen)
+        kept = [one for one in turns if one.cost < chosen.cost + TWENTY_TO_ONE]
+    return min(kept, key=_cost, default=chosen)
 
 
-def _score(one: Hypothesis) -> float:
-    return one.score
+def _cost(one: Hypothesis) -> float:
+    return one.cost
 
 
 def _is_beyond_one_camera(posterior: Posterior, best: Hypothesis, free: float) -> bool:
@@ -245,8 +246,8 @@ def _choice(tried: Sequence[Hypothesis], best: Hypothesis, *, requested: bool) -
     if requested:
         return ModelChoice(best.fit, "; as requested")
     listed = [
-        f"{one.fit.model.name} {one.fit.adjusted.sigma:.2f} pixels"
-        + (", an impossible layout" if one.implausible else f", {one.score - best.score:+.0f}")
+        f"{one.fit.model.name} {one.fit.result.sigma:.2f} pixels"
+        + (", an impossible layout" if one.implausible else f", {one.cost - best.cost:+.0f}")
         for one in tried
         if one is not best
     ]

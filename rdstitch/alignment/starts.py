@@ -37,13 +37,13 @@ def fit_model(
 
 def start_from(problem: Problem, model: MotionModel, other: Fit) -> Parameters:
     """Another model's solution as this model's start."""
-    at = other.adjusted.parameters
+    at = other.result.parameters
     poses = model.poses_from(other.model, at.poses, at.shared, problem.camera_priors.attitudes)
     return replace(at, poses=poses, shared=at.shared if model.one_camera else np.empty(0))
 
 
 def _tree(problem: Problem) -> SpanningTree:
-    """Of the links trusted most, from the reference."""
+    """The spanning tree of the links trusted most, from the reference."""
     o = problem.observations
     return spanning_tree(problem.count, o.image1, o.image2, problem.trust, problem.reference)
 
@@ -76,7 +76,7 @@ def _one_camera_links(
     """
     planar = [other for other in others if other.model.one_camera]
     if shared is None and planar:
-        shared = planar[-1].adjusted.parameters.shared
+        shared = planar[-1].result.parameters.shared
     elif shared is None:
         adjuster, at = best_trial(problem, model)
         shared = (at if len(problem.observations) == 1 else adjuster.run(at).parameters).shared

@@ -58,7 +58,7 @@ class Trajectory:
             raise ArgumentError(f"a trajectory has one value of each kind a frame, not {sorted(counts)} of them")
 
     def labelled(self, names: Sequence[str], numbers: ArrayLike, timestamps: ArrayLike) -> Self:
-        """The same with name, number and time stamp of each image of the whole sequence."""
+        """The trajectory with name, number and time stamp of each image of the whole sequence."""
         chosen = self.frame
         return replace(
             self,

@@ -31,11 +31,11 @@ from rdstitch.alignment.starts import fit_model
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.choices import Purpose
 from rdstitch.robust.covariance import enlarged
-from rdstitch.robust.posterior import LENS, MODEL_ERROR
+from rdstitch.robust.posterior import MODEL_ERROR
+from rdstitch.robust.priors import LENS_PRIORS
 
-_ENOUGH, _MIN_MATCHES_PER_LINK = 6000, 20
-"""Matches in all, and of each link at least, that say how high and how wide the hills are."""
-
+_ENOUGH = 6000  # matches in all that say how high and how wide the hills are
+_MIN_MATCHES_PER_LINK = 20  # matches of each link at least
 _UNLIKELY_FOCAL = 4.0
 """Standard deviations of what is known of a focal length beyond which it may stand for something else."""
 
@@ -52,7 +52,7 @@ def covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray]:
     free_every, named = replace(problem, free_lens=np.ones_like(problem.free_lens)), len(fit.model.shared_names)
     every = np.arange(named + len(problem.free_lens))
     estimated = every[np.concatenate([np.ones(named, dtype=np.bool_), problem.free_lens])]
-    of_estimated, considered = sandwich_covariances(free_every.adjuster_of(fit), fit.adjusted, (estimated, every))
+    of_estimated, considered = sandwich_covariances(free_every.adjuster_of(fit), fit.result, (estimated, every))
     if problem.free_lens.any():  # what is left open of the lens moves tilt and focal length, too
         ratio = np.diag(considered)[:named] / np.maximum(np.diag(of_estimated)[:named], 1e-300)
         grown = np.append(np.sqrt(np.maximum(ratio, 1.0)), np.ones(len(of_estimated) - named))
@@ -102,7 +102,7 @@ def _relief(adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> Relie
 
 
 def _influence(response: LinearResponse) -> tuple[FloatArray, FloatArray]:
-    """By how much each correspondence moves the shared parameters (M, S'), and their covariance by the priors alone."""
+    """Influence of each correspondence on the shared parameters (M, S'), and their covariance by the priors alone."""
     normal = response.normal
     count = len(normal.gradient_shared)
     poses, shared = normal.responses(np.zeros_like(normal.coupling), -np.eye(count))
@@ -166,11 +166,11 @@ def considered_covariance(problem: Problem, fit: Fit, covariance: FloatArray, *,
     """
     count, deviation = len(problem.free_lens), 0.0
     if fit.model.has_metric_poses:
-        log_focal = float(fit.model.physical_parameters(fit.adjusted.parameters.shared)[0][-1])
+        log_focal = float(fit.model.physical_parameters(fit.result.parameters.shared)[0][-1])
         deviation = log_focal - problem.camera_priors.log_focal
     if not over_relief and abs(deviation) > _UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
         adjuster = replace(problem, free_lens=np.ones_like(problem.free_lens)).adjuster_of(fit)
-        together = adjuster.covariance(fit.adjusted)
+        together = adjuster.covariance(fit.result)
         focal = len(fit.model.shared_names) - 1
         moved = together[-count:, focal] * (deviation / together[focal, focal])
         covariance = covariance + np.outer(moved, moved)
@@ -187,9 +187,9 @@ def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, ove
     """
     free = fit_model(problem, HOMOGRAPHY)
     posterior = Posterior(problem, Purpose.TRAJECTORY)
-    against = float(np.clip((posterior.scored(free).score - posterior.scored(fit).score) / 2.0, -50.0, 50.0))
+    against = float(np.clip((posterior.hypothesis(free).cost - posterior.hypothesis(fit).cost) / 2.0, -50.0, 50.0))
     of_free = 1.0 / (1.0 + math.exp(against))
-    off = free.adjusted.parameters.lens - fit.adjusted.parameters.lens
+    off = free.result.parameters.lens - fit.result.parameters.lens
     other = considered_covariance(problem, free, covariances(problem, free)[1], over_relief=over_relief)
     mixed: FloatArray = (1.0 - of_free) * covariance + of_free * (other + np.outer(off, off))
     return mixed
@@ -203,10 +203,10 @@ def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:
     """
     if problem.free_lens.sum() != 1:
         return fit
-    parameters, prior = fit.adjusted.parameters, LENS[0]
+    parameters, prior = fit.result.parameters, LENS_PRIORS[0]
     value = float(parameters.lens[0])
     # What the images say without the prior, which has had its part in the adjustment: the value and its variance.
-    total = 1.0 / float(problem.adjuster_of(fit).covariance(fit.adjusted)[-1, -1])
+    total = 1.0 / float(problem.adjuster_of(fit).covariance(fit.result)[-1, -1])
     of_prior = prior.curvature(value)
     of_data = max(total - of_prior, 1e-9 * total)  # information
     variance = max(float(covariance[-1, -1]) - of_prior / total**2, 1.0 / total) * (total / of_data) ** 2
@@ -215,9 +215,9 @@ def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:
         return fit
     fixed = replace(problem, free_lens=np.zeros_like(problem.free_lens))
     lens = np.where(problem.free_lens, weighed, parameters.lens)
-    adjusted = fixed.refine(fit.model, replace(parameters, lens=lens), fit.tilt_spread).adjusted
+    adjusted = fixed.refine(fit.model, replace(parameters, lens=lens), fit.tilt_spread).result
     # λ was held at a weighed value to adjust the rest; it is estimated all the same.
-    return replace(fit, adjusted=replace(adjusted, adjuster=problem.adjuster_of(fit)))
+    return replace(fit, result=replace(adjusted, adjuster=problem.adjuster_of(fit)))
 
 
 def lever_std(problem: Problem, fit: Fit) -> float:
@@ -226,12 +226,12 @@ def lever_std(problem: Problem, fit: Fit) -> float:
     Standard deviation of a coordinate, in heights of the reference image: tilts that grow along a flight over hills put
     all nadirs right, and make the ground larger or smaller.
     """
-    adjuster, parameters, model = problem.adjuster_of(fit), fit.adjusted.parameters, fit.model
-    steps_of_poses, steps_of_shared = _relief(adjuster, fit.adjusted).steps()
+    adjuster, parameters, model = problem.adjuster_of(fit), fit.result.parameters, fit.model
+    steps_of_poses, steps_of_shared = _relief(adjuster, fit.result).steps()
     size, images = model.pose_size, np.arange(problem.count)
     focal = model.focal(parameters.shared)
     middles = PlaneMarks(images, np.zeros((len(images), 2)), np.zeros((len(images), 2)), np.ones(len(images)))
-    derivative = middles.equations(fit.adjusted.matrices, parameters.lens, adjuster.free.lens, focal)[1]
+    derivative = middles.equations(fit.result.matrices, parameters.lens, adjuster.free.lens, focal)[1]
     derivative[:, [0, 1], [model.free.index(column) for column in (X, Y)]] -= 1.0
     moved = derivative[:, :, size:] @ steps_of_shared
     moved += derivative[:, :, :size] @ steps_of_poses
@@ -246,8 +246,8 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
     """
     if problem.free_lens.any():  # what is left open of the lens moves them, too
         problem = replace(problem, free_lens=np.ones_like(problem.free_lens))
-    adjuster, model, parameters = problem.adjuster_of(fit), fit.model, fit.adjusted.parameters
-    normal, (count, size) = adjuster.normal_equations(fit.adjusted), adjuster.free.poses.shape
+    adjuster, model, parameters = problem.adjuster_of(fit), fit.model, fit.result.parameters
+    normal, (count, size) = adjuster.normal_equations(fit.result), adjuster.free.poses.shape
     of_pose, by_shared, of_shared = normal.pose_covariances()
     of_first = np.zeros((count, size, size))
     of_first[0] = np.eye(size)
@@ -262,7 +262,7 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
 
     jacobian = pose_jacobian(model, parameters.poses, parameters.shared, problem.reference)
     jacobian = np.pad(jacobian, ((0, 0), (0, 0), (0, size + len(of_shared) - jacobian.shape[2])))  # by the lens
-    relief = _relief(adjuster, fit.adjusted)
+    relief = _relief(adjuster, fit.result)
     # A lens that was held, although the images show more of it, has moved the poses by the step to the freed one.
     steps_of_poses, steps_of_shared = (
         np.concatenate(steps, axis=-1) for steps in zip(relief.steps(), relief.response.step(), strict=True)

@@ -142,7 +142,7 @@ def kind_of(fisheye: bool) -> LensKind:
 
 def _without_radial_terms(camera: Camera, kind: LensKind) -> LensModel:
     """The camera's focal length, and the two directions' difference and the tangential terms of its lens."""
-    lens, focal = camera.lens_model, camera.with_focal().focal
+    lens, focal = camera.lens_model, camera.with_guessed_focal().focal
     assert focal is not None
     if lens is None:
         return LensModel((focal, focal), camera.center, (0.0,) * 4)

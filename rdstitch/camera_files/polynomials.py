@@ -149,7 +149,7 @@ class Polynomial:
 
 def fitted_polynomial(camera: Camera, unit: float, powers: tuple[int, ...]) -> Polynomial:
     """The polynomial of a camera by least squares; a fisheye's where that is nearer and the other one is not close."""
-    focal, lenses = camera.with_focal().focal, []
+    focal, lenses = camera.with_guessed_focal().focal, []
     assert focal is not None
     size, base = focal / unit, LensModel((focal, focal), camera.center, (), "polynomial")
     samples = LensSamples.of(camera, base)

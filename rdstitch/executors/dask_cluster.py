@@ -2,6 +2,7 @@
 
 import contextlib
 import logging
+import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from importlib import import_module
@@ -63,8 +64,11 @@ class DaskExecutor(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        self._tasks.shutdown(wait=wait and not cancel_futures)
-        self._open.close()
+        if wait or cancel_futures:
+            self._tasks.shutdown(wait=not cancel_futures)
+            self._open.close()
+        else:  # the client is closed when its tasks have ended
+            threading.Thread(target=self.shutdown).start()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None

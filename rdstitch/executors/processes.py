@@ -29,6 +29,7 @@ _ONE_THREAD = (
     "OPENCV_FOR_THREADS_NUM",
 )
 _ATTEMPTS = 2  # at a task whose worker died
+_LENGTH = 8  # bytes, of the length of a pickle
 
 
 class ProcessExecutor(Executor):
@@ -49,7 +50,10 @@ class ProcessExecutor(Executor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         self._threads.shutdown(wait, cancel_futures=cancel_futures)
-        self._stop()
+        if wait:
+            self._stop()
+        else:  # the workers end when their tasks have
+            threading.Thread(target=self.shutdown).start()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -65,12 +69,12 @@ class ProcessExecutor(Executor):
             assert worker.stdin is not None
             assert worker.stdout is not None
             try:
-                worker.stdin.write(task)
-                worker.stdin.flush()
-                succeeded, result = pickle.load(worker.stdout)
-            except (EOFError, OSError, ValueError, pickle.UnpicklingError):  # ended from outside, or by _stop
+                _send(worker.stdin, task)
+                answer = _receive(worker.stdout)
+            except (EOFError, OSError, ValueError):  # ended from outside, or by _stop
                 _end(worker)
                 continue
+            succeeded, result = pickle.loads(answer)
             if not succeeded:
                 raise result
             return result
@@ -125,31 +129,46 @@ def work() -> None:
     # What a library prints must not come among the results.
     os.dup2(2, 1)
     take_over_memory()
-    tasks: SimpleQueue[Any] = SimpleQueue()
-    threading.Thread(target=_receive, args=(os.fdopen(os.dup(0), "rb"), tasks), daemon=True).start()
+    tasks: SimpleQueue[bytes] = SimpleQueue()
+    threading.Thread(target=_queue_tasks, args=(os.fdopen(os.dup(0), "rb"), tasks), daemon=True).start()
     while True:
-        results.write(_answer(tasks.get()))
-        results.flush()
+        _send(results, _answer(tasks.get()))
 
 
-def _receive(stream: IO[bytes], tasks: "SimpleQueue[Any]") -> None:
+def _queue_tasks(stream: IO[bytes], tasks: "SimpleQueue[bytes]") -> None:
     while True:
         try:
-            tasks.put(pickle.load(stream))
+            tasks.put(_receive(stream))
         except EOFError:
             os._exit(0)
-        except Exception as error:  # noqa: BLE001 - it is the task's failure, and goes where the task came from
-            tasks.put(error)
 
 
-def _answer(task: Any) -> bytes:
-    """Whether a task succeeded, and what it gave or raised."""
+def _send(stream: IO[bytes], pickled: bytes) -> None:
+    """Write a pickle after its length: one that cannot be loaded leaves nothing behind for the next."""
+    stream.write(len(pickled).to_bytes(_LENGTH, "big"))
+    stream.write(pickled)
+    stream.flush()
+
+
+def _receive(stream: IO[bytes]) -> bytes:
+    """Read a pickle after its length; EOFError where the other side is gone."""
+    length = int.from_bytes(_exactly(stream, _LENGTH), "big")
+    return _exactly(stream, length)
+
+
+def _exactly(stream: IO[bytes], count: int) -> bytes:
+    content = stream.read(count)
+    if len(content) < count:
+        raise EOFError
+    return content
+
+
+def _answer(task: bytes) -> bytes:
+    """Run a task; whether it succeeded, and what it gave or raised, pickled."""
     try:
-        if isinstance(task, Exception):
-            raise task
-        function, positional, named = task
+        function, positional, named = pickle.loads(task)
         return pickle.dumps((True, function(*positional, **named)), pickle.HIGHEST_PROTOCOL)
-    except BaseException as error:  # noqa: BLE001 - as above
+    except BaseException as error:  # noqa: BLE001 - it is the task's failure, and goes where the task came from
         text = "".join(traceback.format_exception(error))
         error.add_note(f"in a worker process:\n{text}")
         try:

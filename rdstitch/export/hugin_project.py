@@ -94,7 +94,7 @@ def _pose(alignment: Alignment, k: int) -> dict[str, float]:
     """Hugin's parameters of where an image was taken: degrees, and heights to the right, down and back."""
     poses = alignment.poses
     if poses is None:
-        focal = alignment.cameras[k].with_focal().focal or 1.0
+        focal = alignment.cameras[k].with_guessed_focal().focal or 1.0
         scaled = alignment.homographies[k] @ np.diag([1.0, 1.0, focal / alignment.cameras[k].scale])
         rotation = nearest_rotation(scaled * np.sign(np.linalg.det(scaled)))
         place = {}
@@ -114,7 +114,7 @@ def _pose(alignment: Alignment, k: int) -> dict[str, float]:
 
 def _panorama(alignment: Alignment, used: list[int], seen: FloatArray) -> str:
     """The line of the output, at the resolution of the reference image, cropped to what is ``seen`` (3, N, N)."""
-    camera = alignment.cameras[alignment.reference].with_focal()
+    camera = alignment.cameras[alignment.reference].with_guessed_focal()
     focal = camera.focal or 1.0
     x, y, z = seen
     if alignment.poses is None:

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import FocalSource
 from rdstitch.errors import ArgumentError, ImpossibleCameraError
 from rdstitch.geometry.division_model import (
     distort,
@@ -38,7 +39,7 @@ from rdstitch.geometry.planar_motion import turned_tilt
 LENS_PARAMETERS = ("distortion", "distortion2", "distortion3", "center_x", "center_y")
 """The parameters of a lens: λ, μ, ν, and the distortion centre, in the half-diagonal frame."""
 
-FOCAL_LOG_STD = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "guess": 0.3}
+FOCAL_LOG_STD: dict[FocalSource, float] = {"option": 0.01, "file": 0.01, "estimate": 0.05, "exif": 0.05, "guess": 0.3}
 """Standard deviation of the logarithm of a focal length, by where it comes from."""
 
 _LEAST_LOG_STD = 1e-6  # of a focal length: what is exact has no inverse variance
@@ -115,8 +116,8 @@ class Camera:
         Distortion centre and principal point, pixels; the image centre if not given.
     focal : float or None
         Focal length, pixels, or None where nothing is known of it.
-    focal_source : str or None
-        Where the focal length comes from, a key of :data:`FOCAL_LOG_STD`.
+    focal_source : FocalSource or None
+        Where the focal length comes from; None where it is guessed or not known.
     focal_std : float or None
         Standard deviation of an estimated focal length, pixels; None where :data:`FOCAL_LOG_STD` stands for it.
     tilt, tilt_std : (float, float) or None
@@ -151,7 +152,7 @@ class Camera:
     distortion2: float = 0.0
     center: tuple[float, float] = None  # type: ignore[assignment]  # never so once it is made
     focal: float | None = None
-    focal_source: str | None = None
+    focal_source: FocalSource | None = None
     distortion_std: float | None = None
     distortion3: float = 0.0
     lens_covariance: tuple[tuple[float, ...], ...] | None = field(default=None, repr=False)
@@ -303,12 +304,13 @@ class Camera:
             return max(self.focal_std / self.focal, _LEAST_LOG_STD)
         return FOCAL_LOG_STD[self.focal_source or "guess"]
 
-    def with_focal(self, focal: float | None = None, source: str = "guess", std: float | None = None) -> Self:
-        """The camera with a focal length; without one given, with a guessed one where none is known."""
-        if focal is None and self.focal is not None:
-            return self
-        guessed = _GUESSED_FOCAL * self.scale if focal is None else focal
-        return replace(self, focal=guessed, focal_source=source, focal_std=std)
+    def with_focal(self, focal: float, source: FocalSource = "guess", std: float | None = None) -> Self:
+        """The camera with a focal length, pixels."""
+        return replace(self, focal=focal, focal_source=source, focal_std=std)
+
+    def with_guessed_focal(self) -> Self:
+        """The camera with its focal length; with a guessed one where none is known."""
+        return self if self.focal is not None else self.with_focal(_GUESSED_FOCAL * self.scale)
 
     def without_focal(self) -> Self:
         """The camera without its focal length."""

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, cast
 
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
+from rdstitch.choices import FocalSource
 from rdstitch.geometry.camera import FOCAL_LOG_STD, Camera
 from rdstitch.geometry.lens_model import LensModel
 from rdstitch.system.file_access import read_text
@@ -18,7 +19,6 @@ from rdstitch.system.records import NonNegative, Pair, Size, Triple, convert, pa
 VERSION = 2
 """Version 1 had λ and μ only, as ``lambda`` and ``lambda2``."""
 
-FocalSource = Literal["option", "file", "exif", "estimate", "guess"]
 _MAX_COEFFICIENTS = 8  # of lens models: OpenCV's rational one
 _Row = tuple[float, float, float, float, float]
 _Covariance = tuple[_Row, _Row, _Row, _Row, _Row]

@@ -54,20 +54,20 @@ def _solved(
     tolerance: float,
 ) -> FloatArray:
     """See :func:`conjugate_gradients`."""
-    x, left, ones = start, right - multiply(start), np.ones(len(right))
-    enough = tolerance**2 * np.where(right.any(axis=0), (right**2).sum(axis=0), (left**2).sum(axis=0))
+    x, residual, ones = start, right - multiply(start), np.ones(len(right))
+    limit = tolerance**2 * np.where(right.any(axis=0), (right**2).sum(axis=0), (residual**2).sum(axis=0))
     direction, previous, definite = np.zeros_like(x), np.ones(x.shape[1]), np.ones(x.shape[1], dtype=np.bool_)
     for _ in range(_MAX_STEPS):
-        going = definite & (ones @ left**2 > enough)
-        if not going.any():
+        active = definite & (ones @ residual**2 > limit)
+        if not active.any():
             break
-        better = precondition(left)
-        now = ones @ (left * better)
-        direction = np.where(going, better + now / previous * direction, 0.0)
-        along = multiply(direction)
-        curvature = ones @ (direction * along)
-        definite &= ~going | (curvature > 0.0)  # else nothing better is known than what was reached
-        going &= definite
-        step = np.where(going, now, 0.0) / np.where(going, curvature, 1.0)
-        x, left, previous = x + step * direction, left - step * along, np.where(going, now, 1.0)
+        preconditioned = precondition(residual)
+        product = ones @ (residual * preconditioned)
+        direction = np.where(active, preconditioned + product / previous * direction, 0.0)
+        moved = multiply(direction)
+        curvature = ones @ (direction * moved)
+        definite &= ~active | (curvature > 0.0)  # else nothing better is known than what was reached
+        active &= definite
+        step = np.where(active, product, 0.0) / np.where(active, curvature, 1.0)
+        x, residual, previous = x + step * direction, residual - step * moved, np.where(active, product, 1.0)
     return x

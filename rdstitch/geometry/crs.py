@@ -19,18 +19,14 @@ class NotMetricError(ArgumentError):
     """A coordinate system that is no map in metres."""
 
 
-_AXIS, _FLATTENING = 6378137.0, 1 / 298.257223563
-"""Of the ellipsoid: the semi-major axis, m."""
-
-_SCALE, _FALSE_EASTING, _FALSE_NORTHING = 0.9996, 500_000.0, 10_000_000.0
-"""Of UTM, m; the northing in the south only."""
-
-_POLAR_SCALE, _POLAR_FALSE = 0.994, 2_000_000.0
-"""Of UPS; m, along both axes."""
-
-_POLAR = 61
-"""The zone after the last one is UPS."""
-
+_AXIS = 6378137.0  # m: semi-major axis of the ellipsoid
+_FLATTENING = 1 / 298.257223563
+_SCALE = 0.9996  # of UTM on the central meridian
+_FALSE_EASTING = 500_000.0  # m, of UTM
+_FALSE_NORTHING = 10_000_000.0  # m, of UTM in the south
+_POLAR_SCALE = 0.994  # of UPS at the pole
+_POLAR_FALSE = 2_000_000.0  # m, of UPS along both axes
+_POLAR = 61  # the zone after the last one of UTM: UPS
 _THIRD_FLATTENING = _FLATTENING / (2 - _FLATTENING)
 _RADIUS = _SCALE * _AXIS / (1 + _THIRD_FLATTENING) * (1 + _THIRD_FLATTENING**2 / 4 + _THIRD_FLATTENING**4 / 64)
 _ECCENTRICITY = math.sqrt(_FLATTENING * (2 - _FLATTENING))
@@ -40,7 +36,8 @@ _POLAR_RADIUS = (
     * _AXIS
     / math.sqrt((1 + _ECCENTRICITY) ** (1 + _ECCENTRICITY) * (1 - _ECCENTRICITY) ** (1 - _ECCENTRICITY))
 )
-_NORTH, _SOUTH = 32600, 32700  # EPSG codes of UTM on WGS 84 are these and the zone
+_NORTH = 32600  # plus the zone: EPSG code of UTM on WGS 84 in the north
+_SOUTH = 32700  # plus the zone: the same in the south
 
 WGS84 = 4326
 """Code of latitude and longitude on WGS 84."""

@@ -28,15 +28,18 @@ focal-normalized points of a wide lens reaches further than half diagonals."""
 OBSERVABLE_STD = 0.1
 """Standard deviation of λ from which on it counts as not observable: a tenth of the radius at the corner."""
 
-_NEWTON_STEPS, _NEWTON_TOLERANCE = 40, 1e-14
-_QUICK_STEPS, _QUICK_TOLERANCE = 8, 1e-9  # of Newton's method alone: the error left is the square of the last step
+_NEWTON_STEPS = 40
+_NEWTON_TOLERANCE = 1e-14
+_QUICK_STEPS = 8  # steps of Newton's method alone
+_QUICK_TOLERANCE = 1e-9  # last step of it: the error left is its square
 _RATIO_STEPS = 12
 _FARTHEST = 4.0
 """Half diagonals: with more coefficients than λ the model is not used beyond, where only the highest power counts."""
 
 _STRETCH_SAMPLES = 4096
 
-_NEAREST_STEPS, _NEAREST_TOLERANCE = 20, 1e-13
+_NEAREST_STEPS = 20
+_NEAREST_TOLERANCE = 1e-13
 
 
 def divisor(radius2: FloatArray, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
@@ -224,7 +227,7 @@ def _distorted_radius(radius: FloatArray, distortion: float, higher: tuple[float
 
 
 def _guarded_radius(radius: FloatArray, distortion: float, higher: tuple[float, ...]) -> FloatArray:
-    """The same (N,) where there is a solution, by Newton's method with bisection."""
+    """Undistorted radii (N,) where there is a solution, by Newton's method with bisection."""
     limit = valid_radius(distortion, higher)
     with np.errstate(over="ignore", invalid="ignore"):
         low, high = np.zeros_like(radius), np.full_like(radius, limit)

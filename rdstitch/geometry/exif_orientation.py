@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 
 SIDEWAYS = (5, 6, 7, 8)
-"""Orientations that exchange the axes; what runs backwards, runs so after that."""
+"""Orientations that exchange the axes, before either of them is reversed."""
 
-_X_BACKWARDS, _Y_BACKWARDS = (2, 3, 6, 7), (3, 4, 7, 8)
+_X_BACKWARDS = (2, 3, 6, 7)  # orientations that reverse the first axis
+_Y_BACKWARDS = (3, 4, 7, 8)  # orientations that reverse the second
 _INVERSES = {6: 8, 8: 6}
 _UNMIRRORED = {2: 1, 4: 3, 5: 8, 7: 6}
 

@@ -12,7 +12,8 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.division_model import horner
 
-_NEWTON_STEPS, _NEWTON_TOLERANCE = 20, 1e-10
+_NEWTON_STEPS = 20
+_NEWTON_TOLERANCE = 1e-10
 
 LensKind = Literal["brown", "fisheye", "polynomial", "fisheye polynomial"]
 

@@ -28,7 +28,7 @@ def nearest_points(points: FloatArray, queries: FloatArray, count: int) -> tuple
 
 
 def separate_neighbours(points: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Of each point the nearest other one that is not the same feature, for how much the errors of neighbours agree.
+    """The nearest other point of each that is not the same feature, for how much the errors of neighbours agree.
 
     Of ``points`` (N, D), in half diagonals: distances and indices, both (N,). Where all of the three nearest are the
     same feature, the farthest of these, no farther than :data:`SAME_FEATURE`; the point itself where there is no other.

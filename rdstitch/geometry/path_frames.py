@@ -41,7 +41,7 @@ def covariance_in_frame(covariance: FloatArray, frame: TrajectoryFrame) -> Float
 
 
 def ros_covariance(covariance: FloatArray, frame: TrajectoryFrame) -> FloatArray:
-    """The same (..., 6, 6) of x, y, z and the turns about these axes, radians, as messages of ROS have it.
+    """Covariances (..., 6, 6) of x, y, z and the turns about these axes, radians, as messages of ROS have them.
 
     The tilt has been taken out of the poses: of the turns about x and y nothing is said.
     """

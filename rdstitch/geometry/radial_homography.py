@@ -118,12 +118,12 @@ class TransferJacobian:
 
     @property
     def by_homography(self) -> FloatArray:
-        """By the entries of H, row by row, shape (N, 2, 9)."""
+        """Derivatives by the entries of H, row by row, shape (N, 2, 9)."""
         entries: FloatArray = self.by_image[:, :, None] * self.lifted
         return entries.reshape(2, 9, -1).transpose(2, 0, 1)
 
     def by_lens(self, free: BoolArray) -> FloatArray:
-        """By those of :data:`rdstitch.geometry.camera.LENS_PARAMETERS` that are ``free`` (5,), shape (2, K, N).
+        """Derivatives (2, K, N) by those of :data:`rdstitch.geometry.camera.LENS_PARAMETERS` that are ``free`` (5,).
 
         The centre shifts in both images.
         """

@@ -73,7 +73,7 @@ def views_of(
         foot = as_complex(centres[:, :2])
         return Views(middle, foot, centres[:, 2], right, "poses", pixel, known.focal_log_std, tilt_alone)
     # A guess where nobody knows the focal length.
-    height = np.array([c.with_focal().focal or 0.0 for c in cameras]) * np.abs(next_pixel - middle)
+    height = np.array([c.with_guessed_focal().focal or 0.0 for c in cameras]) * np.abs(next_pixel - middle)
     below = [_below(camera, nadir) for camera, nadir in zip(cameras, nadirs, strict=True)]
     if all(pixel is not None for pixel in below):
         foot = np.array([_in_output(*one, pixel) for one, pixel in zip(each, below, strict=True) if pixel is not None])

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray, evenly_spaced
+from rdstitch.arrays import BoolArray, FloatArray, evenly_spaced
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField
@@ -16,16 +16,15 @@ from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
 from rdstitch.local_alignment.ground import fit_ground
 from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatches, place_matches
 
-# Cells of a grid that finds what is far from the plane, and of the one that is used; nodes of all images together, by
-# which the finer one is coarser for more than some 70 images, and both for more than 800.
-_COARSE, _FINE = (12, 120_000), (24, 40_000)
-_SLOPES = (0.2, 0.06, 0.02)
+_COARSE = 12, 120_000  # cells of a grid that finds what is far from the plane; nodes of all images at most
+_FINE = 24, 40_000  # the same of the grid that is used: it is coarser for more than some 70 images
+_SLOPES = (0.2, 0.06, 0.02)  # see Stiffness
 _SLOPES_OF_GROUND = (0.5, 0.2, 0.06)  # one surface for all images, which many matches determine, may be freer
 _HELD_OUT = 5  # every fifth track: a keypoint brings its error to all its matches, fitted or not
-_WORTHWHILE = 0.15  # share by which what a person sees must get less for local alignment to be worth while
-# A person sees edges that do not go on across seams, as far as this percentile of the held-out residuals, and straight
-# edges, of a tenth of the diagonal or more, that fields bend up to this percentile: a single one is seen.
-_SEAMS, _BENDS, _EDGE = 75.0, 98.0, 0.1
+_WORTHWHILE = 0.15  # fraction by which what a person sees must get less for local alignment to be worth while
+_SEAMS = 75.0  # percentile of the held-out residuals: as far as that a person sees edges that do not go on across seams
+_BENDS = 98.0  # percentile of the bends of straight edges, of which a person sees a single one
+_EDGE = 0.1  # diagonals: length from which on an edge is seen to be straight
 _MAX_IMAGES = 24  # whose edges are looked at
 _MIN_MATCHES = 60  # of 60 planes with so many matches and noise, none was bent; with 40, five were
 _MAX_MATCHES = 250_000  # that fields are fitted to, 600 bytes each: of thousands of images a part
@@ -44,7 +43,7 @@ class HeldOut:
 
     @classmethod
     def of(cls, residual: FloatArray) -> "HeldOut":
-        """From residuals (M, D)."""
+        """Percentiles of residuals (M, D)."""
         length = np.linalg.norm(residual, axis=1)
         return cls(float(np.median(length)), float(np.percentile(length, 95)))
 
@@ -112,18 +111,10 @@ def align_locally(
     limit = worthwhile if choice == "auto" else math.inf
     straight = cache(lambda: _long_edges(edges, cameras))
     base = ground = None
-    for slope in _SLOPES_OF_GROUND:
-        if centers is None:
-            break
-        part = _ground(fitted, images, centers, Stiffness(cells, slope))
-        cost = _seam_residual(tested.residual_with(part.delivered, images))
-        if cost > worthwhile:
-            continue
-        # Of all matches, as it is delivered: bends without a fifth of them depend on which fifth it is.
-        whole = _ground(placed, images, centers, part.stiffness)
-        if cost + _bend(whole.delivered, straight()) <= worthwhile:
-            base, ground, limit = part, whole, math.inf
-            break
+    if centers is not None:
+        base, ground = _rough_ground(placed, held_out, images, centers, cells, straight, worthwhile)
+    if ground is not None:
+        limit = math.inf
     candidates = list(_candidates(fitted, tested, images, min(coarse, cells), cells, base))
     costs = [_seam_residual(candidate.residual) for candidate in candidates]
     if min(costs) <= limit:
@@ -141,6 +132,28 @@ def align_locally(
         text += f"; a grid of {cells} instead of {choice} cells, the finest that so many images may have"
     final = fit_fields(placed, images, best.fit.stiffness, best.fit, ground)
     return LocalAlignment(final.delivered, text, cells, ground is not None, before, after)
+
+
+def _rough_ground(
+    placed: PlacedMatches,
+    held_out: BoolArray,
+    images: ImagesOnSurface,
+    centers: FloatArray,
+    cells: int,
+    straight: Callable[[], dict[int, FloatArray]],
+    worthwhile: float,
+) -> tuple[PlacedFields, PlacedFields] | tuple[None, None]:
+    """The freest worthwhile heights of the ground, by matches not held out and by all; None where none are."""
+    fitted, tested = placed.take(~held_out), placed.take(held_out)
+    for slope in _SLOPES_OF_GROUND:
+        part = _ground(fitted, images, centers, Stiffness(cells, slope))
+        cost = _seam_residual(tested.residual_with(part.delivered, images))
+        if cost <= worthwhile:
+            # Of all matches, as it is delivered: bends without a fifth of them depend on which fifth it is.
+            whole = _ground(placed, images, centers, part.stiffness)
+            if cost + _bend(whole.delivered, straight()) <= worthwhile:
+                return part, whole
+    return None, None
 
 
 def _ground(matches: PlacedMatches, images: ImagesOnSurface, centers: FloatArray, stiffness: Stiffness) -> PlacedFields:
@@ -184,7 +197,7 @@ def _seam_residual(residual: FloatArray) -> float:
 
 
 def _long_edges(edges: Callable[[list[int]], Iterable[FloatArray]], cameras: Sequence[Camera]) -> dict[int, FloatArray]:
-    """Those of some images that are long enough to be seen to be straight."""
+    """Edges of some images that are long enough to be seen to be straight."""
     chosen = evenly_spaced(len(cameras), _MAX_IMAGES).tolist()
     return {
         k: ends[np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) > _EDGE * 2.0 * cameras[k].scale]

@@ -64,7 +64,7 @@ class DisplacementField:
         return expected
 
     def resized(self, image_size: tuple[int, int]) -> "DisplacementField":
-        """The same for an image of another size that shows the same."""
+        """The field for a resized copy of the image."""
         ratio = np.array(image_size, dtype=np.float64) / self.image_size
         return DisplacementField(image_size, self.values * ratio)
 
@@ -79,7 +79,7 @@ class DisplacementField:
         return float(self._steepness.max())
 
     def levelled(self, steepest: float) -> "DisplacementField":
-        """The same with changes of at most ``steepest`` per pixel: nodes of steeper cells near their neighbours.
+        """Limit changes to ``steepest`` per pixel: nodes of steeper cells move towards their neighbours.
 
         Only a field that is too steep nearly everywhere becomes smaller everywhere.
         """
@@ -118,13 +118,13 @@ class DisplacementField:
 
     @cached_property
     def _coefficients(self) -> FloatArray:
-        """Of the B-spline, with the apron around, (rows, columns, 2)."""
+        """Coefficients of the B-spline, with the apron around, (rows, columns, 2)."""
         down, across = (_prefilter(n) for n in self.values.shape[:2])
         return np.moveaxis(down @ np.moveaxis(self.values, -1, 0) @ across.T, 0, -1)
 
 
 def _extent(image_size: tuple[int, int]) -> FloatArray:
-    """From the first to the last pixel, (2,); of a single one, whose place is the first, the pixel itself."""
+    """Distance from the first to the last pixel, (2,); 1 where there is one pixel only."""
     return np.maximum(np.array(image_size) - 1.0, 1.0)
 
 
@@ -138,7 +138,7 @@ def _cubic_weights(at: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _prefilter(count: int) -> FloatArray:
-    """From values at nodes in a row to the coefficients of their cubic B-spline (count + 2 aprons, count)."""
+    """Matrix (count + 2 aprons, count) from values at nodes in a row to the coefficients of their cubic B-spline."""
     around = ((_APRON, _APRON), (0, 0))
     padded = np.pad(np.eye(count), around, mode="reflect", reflect_type="odd")
     one, next_to = np.eye(len(padded)), np.eye(len(padded), k=1)
@@ -149,7 +149,7 @@ def _prefilter(count: int) -> FloatArray:
 
 @lru_cache(maxsize=64)
 def _evaluation(count: int) -> FloatArray:
-    """From values at nodes in a row to those of their spline at evenly spread places, some between two nodes."""
+    """Matrix from values at nodes in a row to those of their spline at evenly spread places, some between two nodes."""
     place = np.linspace(0.0, count - 1.0, _PROBES * (count - 1) + 1) + _APRON
     cell = np.minimum(place.astype(np.intp), count + _APRON - 2)
     basis = np.zeros((len(place), count + 2 * _APRON))

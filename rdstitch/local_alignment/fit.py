@@ -23,17 +23,17 @@ from rdstitch.local_alignment.field import DisplacementField, bilinear, grid_sha
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches
 from rdstitch.system.late_imports import sparse, sparse_linalg
 
-# Residuals are trusted up to about this many times their median, or their noise where relief makes them larger, but at
-# least so many pixels; at first, up to this percentile of them, then by this factor less from round to round, and as
-# many rounds at the end.
-_ROBUST, _MIN_SCALE = 2.0, 0.3
-_WIDEST, _SHARPENED, _SHARP_ROUNDS = 95.0, 0.5, 2
+_ROBUST = 2.0  # medians of the residuals, or their noise where relief makes them larger: width of the loss at the end
+_MIN_SCALE = 0.3  # pixels: width of the loss at the least
+_WIDEST = 95.0  # percentile of the residuals: width of the loss in the first round
+_SHARPENED = 0.5  # factor of the width from round to round
+_SHARP_ROUNDS = 2  # rounds with the last width
 _FADE = 0.2  # share of an image over which a field vanishes where nothing supports it
 _STEPS = 4  # of a fixed-point iteration to where the alignment expects something; each leaves the gradient's share
 _MAX_GRADIENT = 0.5  # change of the displacement per pixel: half of what would fold an image
-# Nodes of all images up to which equations are factorized as they are, cells of a grid from which on there is a coarser
-# one, and the residual of the equations that is left, as a share of their right side: a thousandth of a pixel.
-_FACTORIZED, _MIN_HALVED, _TOLERANCE = 5000, 8, 1e-6
+_FACTORIZED = 5000  # nodes of all images up to which equations are factorized as they are
+_MIN_HALVED = 8  # cells of a grid from which on there is a coarser one
+_TOLERANCE = 1e-6  # residual of the equations over their right side: a thousandth of a pixel
 _SIGNS = np.array([1.0, -1.0])  # a residual leads from the second image to the first
 
 Shapes = tuple[tuple[int, int], ...]  # rows and columns of the grid of each image
@@ -90,11 +90,11 @@ class Reweighting:
         self._noise, self._sharp = matches.noise, int(known)
         self._scale = 0.0 if known else float(np.percentile(np.linalg.norm(matches.residual, axis=1), _WIDEST))
 
-    def weights(self, left: FloatArray) -> FloatArray | None:
-        """Of matches (M,) by what is left of them (M, D); None after the last round."""
+    def weights(self, residual: FloatArray) -> FloatArray | None:
+        """Weights (M,) of matches by their residuals (M, D); None after the last round."""
         if self._sharp == _SHARP_ROUNDS:
             return None
-        length = np.linalg.norm(left, axis=1)
+        length = np.linalg.norm(residual, axis=1)
         sharpest = max(_MIN_SCALE, _ROBUST * min(float(np.median(length)), self._noise))
         self._sharp += self._scale <= sharpest
         scale = max(self._scale, sharpest)
@@ -120,12 +120,14 @@ def fit_fields(
     priors = [_smoothness(shape, camera.image_size, stiffness) for shape, camera in zip(shapes, cameras, strict=True)]
     prior, coarser = sparse.block_diag(priors, format="csr"), _coarser(shapes, cameras, stiffness.cells)
     known = np.zeros((prior.shape[0], matches.places.shape[-1])) if base is None else np.concatenate(base.values)
-    left, expected = (matches.residual, matches.points.reshape(-1, 2)) if start is None else start.unexplained(matches)
+    residual, expected = (
+        (matches.residual, matches.points.reshape(-1, 2)) if start is None else start.unexplained(matches)
+    )
     reweighting, solution = Reweighting(matches, known=start is not None), known
-    while (weight := reweighting.weights(left)) is not None:
+    while (weight := reweighting.weights(residual)) is not None:
         design = _design(matches, expected, cameras, shapes)
         solution = known + _solve(design, weight, prior, matches.residual - design @ known, coarser)
-        left = matches.residual - design @ solution
+        residual = matches.residual - design @ solution
         expected = _expected(matches, images, design, solution)
     return PlacedFields(images, stiffness, shapes, tuple(np.split(solution, _first_nodes(shapes)[1:-1])))
 
@@ -148,10 +150,12 @@ def _solve(
         return np.asarray(factorized(matrix).solve(right), dtype=np.float64)
     factor, finest = factorized(coarser.T @ matrix @ coarser), 1.0 / matrix.diagonal()[:, None]
 
-    def smooth(left: FloatArray) -> FloatArray:
-        return np.asarray(coarser @ factor.solve(coarser.T @ left), dtype=np.float64)
+    def smooth(residual: FloatArray) -> FloatArray:
+        return np.asarray(coarser @ factor.solve(coarser.T @ residual), dtype=np.float64)
 
-    return conjugate_gradients(matrix, right, smooth(right), lambda left: finest * left + smooth(left), _TOLERANCE)
+    return conjugate_gradients(
+        matrix, right, smooth(right), lambda residual: finest * residual + smooth(residual), _TOLERANCE
+    )
 
 
 def factorized(matrix: Any) -> Any:
@@ -161,12 +165,12 @@ def factorized(matrix: Any) -> Any:
 
 
 def interpolation(nodes: NDArray[np.intp], shares: FloatArray, count: int) -> "sparse.csr_array":
-    """From values at ``count`` nodes to those at places between four of them (N, 4), which have these shares."""
+    """Matrix from values at ``count`` nodes to those at places between four of them (N, 4), weighted so."""
     return sparse.csr_array((shares.ravel(), nodes.ravel(), np.arange(0, nodes.size + 1, 4)), shape=(len(nodes), count))
 
 
 def _coarser(shapes: Shapes, cameras: Sequence[Camera], cells: int) -> "sparse.csr_array | None":
-    """From values at the nodes of grids of half as many cells to those of all images; None where these are few."""
+    """Matrix from the nodes of grids of half as many cells to those of all images; None where these are few."""
     if cells < _MIN_HALVED or _first_nodes(shapes)[-1] <= _FACTORIZED:
         return None
     parts = {}

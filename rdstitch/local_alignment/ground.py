@@ -63,8 +63,8 @@ def fit_ground(matches: PlacedMatches, images: ImagesOnSurface, centers: FloatAr
     # What a height displaces in an image, in the middle of the matches: stiffness is of displacements.
     lever = float(np.median(np.linalg.norm(matches.places - below, axis=-1) / above[..., 0]))
     prior = smoothness(ground.heights.shape, ground.spacing, stiffness.slope / lever, float(np.median(sides)))
-    height, left, reweighting = np.zeros((len(matches), 1, 1)), matches.residual, Reweighting(matches)
-    while (weight := reweighting.weights(left)) is not None:
+    height, residual, reweighting = np.zeros((len(matches), 1, 1)), matches.residual, Reweighting(matches)
+    while (weight := reweighting.weights(residual)) is not None:
         ratio = height / (above - height)
         places = ((matches.places + ratio * below) / (1.0 + ratio)).mean(axis=1)
         by_height = (places[:, None] - below) / (above - height)  # displacement in either image of a unit of height
@@ -75,5 +75,5 @@ def fit_ground(matches: PlacedMatches, images: ImagesOnSurface, centers: FloatAr
         solved = np.minimum(factorized(weighted @ design + prior).solve(right), highest)
         ground = replace(ground, heights=solved.reshape(ground.heights.shape))
         height = (design @ solved)[:, None, None]
-        left = matches.residual - parallax * height[:, 0]
+        residual = matches.residual - parallax * height[:, 0]
     return ground

@@ -48,7 +48,7 @@ class ImagesOnSurface:
 
     @classmethod
     def of(cls, cameras: Sequence[Camera], homographies: FloatArray, *, on_sphere: bool = False) -> Self:
-        """With the scale of the median image."""
+        """Images at the scale of the median image."""
         unscaled = cls(cameras, homographies, on_sphere, 1.0)
         steps = np.array([(0.5, 0.0), (0.0, 0.5), (-0.5, 0.0), (0.0, -0.5)])
         areas = []
@@ -93,11 +93,11 @@ class PlacedMatches(Rows):
 
     @cached_property
     def residual(self) -> FloatArray:
-        """From where the second image puts them to where the first does, (M, D)."""
+        """Residuals (M, D) from where the second image puts matches to where the first does."""
         return np.asarray(self.places[:, 0] - self.places[:, 1])
 
     def residual_with(self, fields: Sequence[DisplacementField], images: ImagesOnSurface) -> FloatArray:
-        """The same between images displaced by their fields; as it is where one of them shows no such place."""
+        """Residuals between images displaced by their fields; without these where one of them shows no such place."""
         points, places = self.points.reshape(-1, 2), self.places.reshape(2 * len(self), -1).copy()
         for k, chosen in self.of_image:
             places[chosen] = images.to_surface(k, fields[k].expected(points[chosen]))
@@ -113,7 +113,7 @@ class PlacedMatches(Rows):
 
     @cached_property
     def tracks(self) -> NDArray[np.intp]:
-        """For each match the number of its track: matches that share keypoints, and so their errors, have the same.
+        """Number of each match's track: matches that share keypoints, and so their errors, have the same.
 
         The longest tracks, which wrong matches make of many, come first.
         """
@@ -129,7 +129,7 @@ class PlacedMatches(Rows):
 
     @cached_property
     def neighbours(self) -> NDArray[np.intp]:
-        """For each match the nearest one of another feature of the same pair of images; itself where there is none."""
+        """The nearest match of another feature of the same pair of images, for each; itself where there is none."""
         new_pair = (self.images[1:] != self.images[:-1]).any(axis=1)
         first = np.concatenate([[0], np.flatnonzero(new_pair) + 1, [len(self)]])
         nearest_other = np.empty(len(self), dtype=np.intp)
@@ -145,13 +145,13 @@ class PlacedMatches(Rows):
         return float(np.median(np.linalg.norm(differences, axis=1)) / np.sqrt(2.0))
 
     def thinned(self, most: int) -> "PlacedMatches":
-        """At most about so many of them, evenly, and no fewer than a few."""
+        """At most about so many of the matches, evenly chosen, and no fewer than a few."""
         count = min(len(self), max(most, _MIN_MATCHES))
         return self if count == len(self) else self.take(np.linspace(0, len(self) - 1, count).astype(np.intp))
 
 
 def place_matches(matches: Iterable[Match], images: ImagesOnSurface) -> Iterator[PlacedMatches]:
-    """For each pair, matches that lie near each other: inliers of the alignment, and a little farther off.
+    """Place the matches of each pair that lie near each other: inliers of the alignment, and a little farther off.
 
     Pairs that have hardly any are left out.
     """

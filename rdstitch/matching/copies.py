@@ -21,7 +21,7 @@ _IDENTITY = np.eye(3)
 
 
 def copies_of(pairs: Sequence[PairRegistration]) -> dict[int, int]:
-    """Of each image that is a copy, by its index, the first image that it is a copy of."""
+    """Map each image that is a copy, by its index, to the first image that it is a copy of."""
     result: dict[int, int] = {}
     moved: dict[int, FloatArray] = {}  # from their first images
     for pair in sorted(pairs, key=lambda pair: pair.images):
@@ -33,7 +33,7 @@ def copies_of(pairs: Sequence[PairRegistration]) -> dict[int, int]:
 
 
 def near_copies_of(pairs: Mapping[Pair, PairRegistration]) -> dict[int, int]:
-    """Of each image that shows almost only what another one shows, that one; registered pairs by their images.
+    """Map each image that shows almost only what another one shows to that one; registered pairs by their images.
 
     Whatever it overlaps with, so does that one: else it may be the only one that joins some images.
     """

@@ -53,7 +53,7 @@ class StoredFeatures:
         return _at_size(features, self.image_size)
 
     def take(self, index: NDArray[np.intp]) -> Self:
-        """Those of the given indices."""
+        """The features of the images of these indices."""
         return replace(self, chosen=index if self.chosen is None else self.chosen[index])
 
     def key(self, cache: Cache) -> str:
@@ -90,12 +90,12 @@ class FeatureStore:
         return np.array([len(item) for item in self.items], dtype=np.intp)
 
     def at_sizes(self, sizes: Sequence[Size]) -> Self:
-        """The same in pixels of the images at other sizes, (width, height) of each."""
+        """The features in pixels of the images at other sizes, (width, height) of each."""
         resized = (replace(item, image_size=size) for item, size in zip(self.items, sizes, strict=True))
         return replace(self, items=tuple(resized))
 
     def strongest(self, most: int) -> Self:
-        """At most so many of each image."""
+        """At most so many features of each image, the strongest."""
         return replace(self, items=tuple(item.take(np.arange(min(most, len(item)))) for item in self.items))
 
 
@@ -130,7 +130,7 @@ class StoredMatches:
         )
 
     def resized(self, before: tuple[Size, Size], after: tuple[Size, Size]) -> Self:
-        """The same in pixels of images of another size."""
+        """The matches in pixels of images of another size."""
         return replace(self, sizes=(*before, *after))
 
     def key(self, cache: Cache) -> str:

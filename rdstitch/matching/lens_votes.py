@@ -23,7 +23,8 @@ _MIN_STD = 2e-4  # λ; no pair knows it better than that the division model hold
 _MIN_INLIERS = 30  # of a pair that votes: three times the parameters of a homography and two λ
 _COMMON_STD = 0.05  # λ; by so much relief and lenses of another kind change what a pair sees, of both images alike
 _MAX_COHERENCE = 0.5  # correlation of neighbours' errors: more is depth, for which λ of either image takes the blame
-_REWEIGHTINGS, _LEAST_RESIDUAL = 6, 0.1  # of the median; standard deviations below which all votes count alike
+_REWEIGHTINGS = 6  # rounds of the median
+_LEAST_RESIDUAL = 0.1  # standard deviations below which all votes count alike
 _PAIRS_AT_ONCE = 64
 
 
@@ -70,7 +71,7 @@ class LensVotes:
         return np.asarray(np.linalg.norm(whitened, axis=1))
 
     def lens_index(self, second: BoolArray) -> IntArray:
-        """From which lens, 0 or 1, the two images of each pair come, shape (L, 2)."""
+        """The lens, 0 or 1, that each of the two images of each pair comes from, shape (L, 2)."""
         return np.stack([second[self.image1], second[self.image2]], axis=1).astype(np.intp)
 
     def fitted(self, lens_index: IntArray, lenses: FloatArray) -> FloatArray:

@@ -20,8 +20,8 @@ _ROUNDS = 3
 _MIN_GAP = 0.01  # λ; what is nearer is one lens that one λ does not quite describe
 _MIN_GAP_PX = 4.0  # the same at a corner, pixels; with one λ, images are off by a tenth of that, rows of them by half
 _MAX_MEAN_RESIDUAL = 1.25  # standard deviations that a vote, two numbers, is off on average; less is luck
-# How many times better two lenses must explain the votes of pairs of both: at least, and times one over their number.
-_MIN_GAIN, _GAIN_OF_FEW = 4.0, 2.8
+_MIN_GAIN = 4.0  # factor by which two lenses must explain the votes of pairs of both better, at least
+_GAIN_OF_FEW = 2.8  # the same times one over the number of such pairs
 _MIN_MARGIN = 5.0  # standard deviations by which votes must tell of which of the two lenses an image is
 
 
@@ -113,7 +113,7 @@ def _divisions(count: int, votes: LensVotes) -> Iterator[tuple[BoolArray, FloatA
 
 
 def _margins(count: int, votes: LensVotes, second: BoolArray, lenses: FloatArray) -> FloatArray:
-    """By how much more the votes were missed if an image came from the other lens, for each image (N,)."""
+    """How much more the votes were missed if each image (N,) came from the other lens."""
     lens_index = votes.lens_index(second)
     missed = votes.mahalanobis_residuals(lenses[lens_index])
     total: FloatArray = np.zeros(count)

@@ -27,7 +27,8 @@ from rdstitch.robust import EstimationOptions
 from rdstitch.system.cache import NO_CACHE, Cache
 from rdstitch.system.progress import Progress
 
-_PAIRS_MATCHED_AT_ONCE, _MIN_BATCHES = 32, 8  # pairs of a task at the most; tasks at the least
+_PAIRS_MATCHED_AT_ONCE = 32  # pairs of a task at the most
+_MIN_BATCHES = 8  # tasks at the least
 
 
 @dataclass(frozen=True)

@@ -176,7 +176,7 @@ def _symmetric(columns: IntArray, values: FloatArray) -> "sparse.csr_array":
 
 
 def _unit_rows(matrix: "sparse.csr_array") -> "sparse.csr_array":
-    """The same with rows of length one; those of zeros stay."""
+    """Scale rows to length one; those of zeros stay."""
     length = np.sqrt(np.asarray(matrix.multiply(matrix).sum(axis=1)).ravel())
     return sparse.csr_array(sparse.diags_array((1.0 / np.maximum(length, 1e-12)).astype(matrix.dtype)) @ matrix)
 

@@ -20,9 +20,8 @@ from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.system.late_imports import spatial
 
-_MIN_IMAGES, _MIN_STATIC = 3, 0.5
-"""Images, in number and as a fraction, that pairs which move must connect: two could agree by chance."""
-
+_MIN_IMAGES = 3  # images that pairs which move must connect: two could agree by chance
+_MIN_STATIC = 0.5  # the same as a fraction of all images
 _MAX_STATIC_MOTION = 1.0 / 3.0
 """Motion of a static match at most, in thresholds: its two keypoints are localised to better than that."""
 
@@ -31,8 +30,8 @@ _MIN_STATIC_MATCHES = 8
 
 _MIN_CONFIRMATIONS = 3  # static matches at one place, from which on every feature there counts as static
 
-_MIN_OVERLAID_PAIRS, _MIN_OVERLAID_SHARE = 2, 0.2
-"""Pairs with such matches, in number and as a fraction of the pairs that move; by one pair alone nothing is decided."""
+_MIN_OVERLAID_PAIRS = 2  # pairs with such matches: by one alone nothing is decided
+_MIN_OVERLAID_FRACTION = 0.2  # the same as a fraction of the pairs that move
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +85,7 @@ def has_static_background(pairs: Sequence[PairRegistration], threshold: float) -
         registered += 1
         static += motion.static
         overlaid += bool(motion.overlay.any())
-    enough = max(_MIN_OVERLAID_PAIRS, _MIN_OVERLAID_SHARE * (registered - static))
+    enough = max(_MIN_OVERLAID_PAIRS, _MIN_OVERLAID_FRACTION * (registered - static))
     return 2 * static > registered or overlaid >= enough
 
 

@@ -124,7 +124,7 @@ class EstimationTask(NamedTuple):
     tilt2: Tilt | None
 
     def pair_matches(self) -> PairMatches:
-        """As estimation takes them."""
+        """The matches as estimation takes them."""
         putative = self.matches.load()
         known = None if self.tilt1 is None or self.tilt2 is None else np.array([self.tilt1, self.tilt2])
         return PairMatches(putative.points1, putative.points2, self.camera1, self.camera2, -putative.ratio, known)

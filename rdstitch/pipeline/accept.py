@@ -7,6 +7,7 @@ import numpy as np
 
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.result import Alignment, LinkFit, links_by_image
+from rdstitch.choices import ModelName
 from rdstitch.errors import PartialResultError
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.pipeline.aligner import Aligner, impossible_estimates_fail
@@ -116,7 +117,7 @@ def _without_damage(registration: Registration, aligner: Aligner, guard: InputGu
     return rest if rest is not None and 2 * rest.alignment.used.sum() > used.sum() else None
 
 
-def _is_simpler(model: str, former: str) -> bool:
+def _is_simpler(model: ModelName, former: ModelName) -> bool:
     """Whether a motion in the plane has less freedom than a former one."""
     by_freedom = [name for name, each in MODELS.items() if not each.on_sphere]
     return {model, former} <= set(by_freedom) and by_freedom.index(model) < by_freedom.index(former)

@@ -115,7 +115,7 @@ class Aligner:
         """From what the user decided, and what the images and their headers say; see :class:`AlignmentOptions`."""
         paths = tuple(str(source.path) for source in sources)
         megapixels = options.features.for_images(len(sources)).limits[1]
-        cameras = tuple(at_working_size(source.camera.with_focal(), megapixels) for source in sources)
+        cameras = tuple(at_working_size(source.camera.with_guessed_focal(), megapixels) for source in sources)
         control = sightings(sources, cameras)
         decided = replace(alignment_options(sources, options), purpose=purpose, control=control)
         return cls(paths, cameras, decided, cache, options.threshold, quarters=QuarterTurns.of(sources))

@@ -18,7 +18,7 @@ import numpy as np
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray, evenly_spaced
-from rdstitch.choices import Purpose
+from rdstitch.choices import ModelName, Purpose
 from rdstitch.compositing.seam_quality import DIAGONAL
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
@@ -42,7 +42,7 @@ from rdstitch.results.registration import Registration
 from rdstitch.verification.verdict import RefusedError
 
 # What a camera can have done: turned, moved over a plane, or anything that joins images of a plane.
-_MODELS = ("rotation", "pose", "homography")
+_MODELS: tuple[ModelName, ...] = ("rotation", "pose", "homography")
 _CLEARLY = 0.5  # share of the broken places up to which another layout is clearly better
 _MISFIT = 2.0  # times the errors of the most probable layout that another one may have
 _SAMPLED_PAIRS = 500  # pairs whose matches say how large errors are

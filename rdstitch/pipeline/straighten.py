@@ -154,7 +154,7 @@ def _focal(placed: PlacedImages) -> Focal:
     if placed.turned:
         lengths = np.linalg.norm(placed.homographies[_reference(placed)], axis=0)
         return Focal(float(lengths[2] / lengths[0]))
-    camera = placed.cameras[_reference(placed)].with_focal()
+    camera = placed.cameras[_reference(placed)].with_guessed_focal()
     assert camera.focal is not None
     return Focal(camera.focal / camera.scale, camera.focal_log_std)
 

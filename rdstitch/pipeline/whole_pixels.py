@@ -99,5 +99,5 @@ def _whole_shifts(registration: Registration) -> FloatArray | None:
         np.array([alignment.cameras[alignment.reference].scale]),
         np.array([min(1.0, (len(places) - 1) / len(left))]),
     )
-    by_model = evidence.score(fitted, _FREEDOM * (len(places) - 1))
-    return places if evidence.score(whole, 0)[0] <= by_model[0] else None
+    by_model = evidence.cost(fitted, _FREEDOM * (len(places) - 1))
+    return places if evidence.cost(whole, 0)[0] <= by_model[0] else None

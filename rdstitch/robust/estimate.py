@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray, IntArray, as_numbers
-from rdstitch.choices import SolverName
+from rdstitch.choices import FocalSource, SolverName
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography, are_homographies
@@ -18,7 +18,7 @@ from rdstitch.robust.measurements import Measurements, checked_matches, padded_l
 from rdstitch.robust.minimal import MinimalSolver, minimal_solvers
 from rdstitch.robust.model_selection import ModelSelection, PairFit, StartedPairs, rms_of
 from rdstitch.robust.pair_models import PlanarPairModel
-from rdstitch.robust.posterior import Prior, focal_prior, known_focal
+from rdstitch.robust.priors import Prior, focal_prior, known_focal
 from rdstitch.robust.ransac import Hypotheses, ransac
 
 _NOT_IN_AUTO = "four_point"  # finds what three points find, from more samples
@@ -70,7 +70,7 @@ class PairMatches:
 
     @property
     def focal_prior(self) -> Prior:
-        """On the logarithm of the focal length."""
+        """Prior on the logarithm of the focal length."""
         return focal_prior(math.log(self.focal), self.camera1.focal_log_std, self.camera1.focal_source or "guess")
 
     @property
@@ -80,7 +80,7 @@ class PairMatches:
 
     @property
     def sizes(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """Of both images, pixels."""
+        """Width and height of both images, pixels."""
         return self.camera1.image_size, self.camera2.image_size
 
     @property
@@ -96,7 +96,7 @@ def estimate_radial_homography(
     *,
     image_size2: tuple[int, int] | None = None,
     focal: float | None = None,
-    focal_source: str | None = None,
+    focal_source: FocalSource | None = None,
     center: tuple[float, float] | None = None,
     solver: SolverName = "auto",
     tilt: ArrayLike | None = None,
@@ -119,7 +119,7 @@ def estimate_radial_homography(
         Of image 2, where it differs: the same lens at another resolution or turned by a quarter.
     focal : float, optional
         Focal length, pixels of image 1; guessed if not given. Models of planar motion use it.
-    focal_source : str, optional
+    focal_source : FocalSource, optional
         How much the focal length can be trusted, a key of :data:`rdstitch.geometry.camera.FOCAL_LOG_STD`;
         "option" if not given.
     center : (float, float), optional
@@ -175,7 +175,7 @@ def estimate_radial_homography(
 
 
 def estimate_radial_homographies(pairs: Sequence[PairMatches], options: EstimationOptions) -> list[RadialHomography]:
-    """As :func:`estimate_radial_homography`, of many pairs at once: several times faster, the same result for each."""
+    """Estimate many pairs at once: several times faster than :func:`estimate_radial_homography`, and the same."""
     if options.solver == "two_point" and any(pair.tilts is None for pair in pairs):
         raise ArgumentError("the two_point solver needs the tilt")
     result: dict[int, RadialHomography] = {}
@@ -195,7 +195,7 @@ def estimate_radial_homographies(pairs: Sequence[PairMatches], options: Estimati
 
 
 def _estimate_batch(pairs: list[PairMatches], options: EstimationOptions) -> list[RadialHomography]:
-    """Of pairs with the same ``batch_key``."""
+    """Estimate pairs with the same ``batch_key``."""
     order = [pair.order for pair in pairs]
     data = Measurements.of_pairs(
         [(pair.points1[ranked], pair.points2[ranked]) for pair, ranked in zip(pairs, order, strict=True)],
@@ -243,7 +243,7 @@ def _selected(
 
 
 def _tilts(tilt: ArrayLike | None) -> FloatArray | None:
-    """Of both images."""
+    """Tilts of both images of each pair; None where none is known."""
     if tilt is None:
         return None
     angles = as_numbers("tilt", tilt)
@@ -287,7 +287,7 @@ def _result(
         parameters=("distortion", *fit.model.parameters),
         distortion_std=fit.distortion_std,
         model=fit.model.name,
-        motion=fit.model.motion(fit.state) if isinstance(fit.model, PlanarPairModel) else None,
+        motion=fit.model.motion(fit.state),
         rms=float(rms_of(errors[None], threshold)[0]),
         solver=solver,
         iterations=iterations,

@@ -8,13 +8,10 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 
-SHORT_STEP, LOOSE_STEP = 0.3, 1.0
-"""Standard deviations of the parameters, all together, of a step that is not worth taking; and where another descent
-goes on from there."""
-
-FIRST_DAMPING, MAX_DAMPING = 1e-4, 1e4
-"""Of the diagonal of the normal matrix: where a descent begins, and beyond which it has got stuck."""
-
+SHORT_STEP = 0.3  # standard deviations of all parameters together: a step that is not worth taking
+LOOSE_STEP = 1.0  # the same where another descent goes on from there
+FIRST_DAMPING = 1e-4  # fraction of the diagonal of the normal matrix with which a descent begins
+MAX_DAMPING = 1e4  # the same beyond which it has got stuck
 _MIN_DAMPING = 1e-9
 
 
@@ -57,7 +54,7 @@ class Problems(Protocol[Equations]):
         ...
 
     def normal_equations(self, parameters: FloatArray) -> Equations:
-        """At parameters (B, K)."""
+        """Normal equations at parameters (B, K)."""
         ...
 
     def cost(self, before: Equations, after: Equations) -> FloatArray:

@@ -33,7 +33,7 @@ class Measurements(Rows):
     def of_pairs(
         cls, points: Sequence[tuple[FloatArray, FloatArray]], cameras: Sequence[tuple[Camera, Camera]]
     ) -> Self:
-        """Of checked matches, pixels (N, 2), and the cameras of both images of each pair."""
+        """Normalize checked matches, pixels (N, 2), by the cameras of both images of each pair."""
         counts = np.array([len(points1) for points1, _ in points], dtype=np.intp)
         width = padded_length(int(counts.max(initial=0)))
         x = np.zeros((2, len(points), 2, width))
@@ -58,7 +58,7 @@ class Measurements(Rows):
         return self.x1[:, 0] ** 2 + self.x1[:, 1] ** 2
 
     def only(self, chosen: BoolArray) -> Self:
-        """Without the matches that are not chosen (B, N)."""
+        """The measurements without the matches that are not chosen (B, N)."""
         return type(self)(self.x1, self.x2, self.present & chosen, self.count, self.px, self.px_ratio)
 
     def at(self, index: IntArray) -> Self:

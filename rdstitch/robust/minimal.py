@@ -10,7 +10,7 @@ from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.division_model import SEARCHED_DISTORTION
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
-from rdstitch.robust.posterior import Prior
+from rdstitch.robust.priors import Prior
 from rdstitch.solvers.solutions import Solutions
 
 # half-diagonal frame: so near to any lens up to a wide angle that some inliers agree

@@ -11,7 +11,8 @@ from rdstitch.geometry.division_model import OBSERVABLE_STD
 from rdstitch.robust.loss import loss_width
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
-from rdstitch.robust.posterior import LENS, Evidence, farthest_error, prior_costs
+from rdstitch.robust.posterior import Evidence, farthest_error
+from rdstitch.robust.priors import LENS_PRIORS, prior_costs
 from rdstitch.robust.refinement import PairEquations, PairProblems, refine_pairs
 
 _STEPS = 20  # of refinement; halved or doubled, the median error of λ changes by a sixth at most
@@ -81,7 +82,7 @@ class ModelSelection:
         fitted = [*(self._fit(model, start) for model in planar), freest]
         every = np.arange(len(pairs.data))
         evidence = Evidence.of(row, pairs.data.x1[row, :, column], every, noise, pairs.data.px)
-        chosen = np.argmin([self._score(each, evidence, row, column) for each in fitted], axis=0)
+        chosen = np.argmin([self._cost(each, evidence, row, column) for each in fitted], axis=0)
         rms = np.stack([rms_of(each.equations.errors, self.threshold) for each in fitted], axis=1)
 
         def finished(index: int, rows: IntArray, why: str) -> dict[int, PairFit]:
@@ -109,11 +110,11 @@ class ModelSelection:
         problems = self._problems(model, pairs)
         return _Fitted(problems, *refine_pairs(problems, pairs.homography, pairs.distortion, pairs.tilts, _STEPS))
 
-    def _score(self, fitted: _Fitted, evidence: Evidence, row: IntArray, column: IntArray) -> FloatArray:
+    def _cost(self, fitted: _Fitted, evidence: Evidence, row: IntArray, column: IntArray) -> FloatArray:
         """-2 log of the posterior of a model of each pair (B,), by the matches at these places, up to a constant."""
         equations, distortion = fitted.equations, fitted.parameters[:, :1]
-        priors = equations.prior + (0.0 if self.fixed_distortion else prior_costs(LENS[:1], distortion)[:, 0])
-        return evidence.score(equations.transferred.whitened(row, column), equations.information.shape[1], priors)
+        priors = equations.prior + (0.0 if self.fixed_distortion else prior_costs(LENS_PRIORS[:1], distortion)[:, 0])
+        return evidence.cost(equations.transferred.whitened(row, column), equations.information.shape[1], priors)
 
     def _finished(self, fitted: _Fitted, pairs: StartedPairs, reasons: list[str]) -> list[PairFit]:
         """The chosen model with its covariance, and without λ where that is not observable."""

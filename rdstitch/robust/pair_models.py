@@ -4,13 +4,14 @@
 "similarity"  the same with a change of height
 "homography"  any homography
 
-The functions of a model take the states of B pairs at once. The state of the planar models is
+The state of the planar models is
 ``(ψ1, θ1, ψ2, θ2, φ, tx, ty, log height, log focal correction)``; of these the free ones are estimated.
 """
 
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -24,11 +25,41 @@ from rdstitch.geometry.planar_motion import (
     rigid_in_plane,
     rotation_from_tilt,
 )
-from rdstitch.robust.posterior import Prior, prior_costs, prior_slopes
+from rdstitch.robust.priors import Prior, prior_costs, prior_slopes
 
 _TILTS, _YAW, _TX, _TY, _HEIGHT, _FOCAL = slice(0, 4), 4, 5, 6, 7, 8
 _PSI, _THETA = (0, 2), (1, 3)
 _COMPLEMENT = np.eye(9)[:, 1:]
+
+
+class PairModel(Protocol):
+    """A parametrisation of the homographies between two images, in the half-diagonal frame, of B pairs at once."""
+
+    @property
+    def name(self) -> str:
+        """Name of the model in the family."""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the P entries of a step."""
+
+    def initialize(self, homography: FloatArray, tilts: FloatArray | None = None) -> FloatArray:
+        """States (B, 9) nearest to homographies (B, 3, 3), for known tilts (B, 2, 2), radians."""
+
+    def homography(self, state: FloatArray) -> FloatArray:
+        """Homographies (B, 3, 3)."""
+
+    def jacobian(self, state: FloatArray) -> FloatArray:
+        """Derivatives of the homographies by a step, shape (B, 9, P)."""
+
+    def retract(self, state: FloatArray, step: FloatArray) -> FloatArray:
+        """States (B, 9) after steps (B, P)."""
+
+    def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Cost (B,) of the states by a prior, and its slope and curvature by a step (B, P)."""
+
+    def motion(self, state: FloatArray) -> PlanarMotion | None:
+        """The planar motion of one state (9,), if the model is one."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +91,12 @@ class HomographyPairModel:
         return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
 
     def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """None."""
+        """Nothing is known."""
         nothing = np.zeros((len(state), len(self.parameters)))
         return nothing[:, 0], nothing, nothing
+
+    def motion(self, state: FloatArray) -> None:
+        """A homography is no planar motion."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +192,7 @@ class PlanarPairModel:
         return np.asarray(state + step @ self._directions)
 
     def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of the focal length, where it is free: its cost (B,), and the slope and curvature by a step (B, P)."""
+        """Prior of a free focal length: its cost (B,), and the slope and curvature by a step (B, P)."""
         slope, curvature = np.zeros((2, len(state), len(self.parameters)))
         if self.focal_prior is None or self.tilts_known:
             return slope[:, 0], slope, curvature
@@ -179,6 +213,3 @@ class PlanarPairModel:
 
 
 _IN_PLANE = np.array([1.0, 1.0, 0.0])
-
-PairModel = HomographyPairModel | PlanarPairModel
-"""A parametrisation of the homography between two images, in the half-diagonal frame."""

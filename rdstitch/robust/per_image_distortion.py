@@ -16,11 +16,11 @@ from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.robust.levenberg_marquardt import descend
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel
-from rdstitch.robust.posterior import LENS, Prior
+from rdstitch.robust.priors import LENS_PRIORS, Prior
 from rdstitch.robust.refinement import PairProblems
 
 _HOMOGRAPHY = HomographyPairModel()
-_LENS = (Prior(), Prior(), LENS[1], *LENS[3:])
+_LENS = (Prior(), Prior(), LENS_PRIORS[1], *LENS_PRIORS[3:])
 """Priors on λ of image 1, λ of image 2, μ, and the distortion centre. The votes of all pairs measure λ: a prior in each
 of them would count as often."""
 

@@ -20,7 +20,8 @@ from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.solvers.solutions import Solutions
 
 # Halved or doubled, none of these changes what is found, only the time.
-_FIRST_BATCH, _MAX_BATCH = 48, 512  # samples a turn; every turn has twice as many as the one before
+_FIRST_BATCH = 48  # samples of the first round; every round has twice as many as the one before
+_MAX_BATCH = 512  # samples of a round at the most
 _ALONE = 512  # samples up to which the solver that assumes least goes on alone if it needs no more
 _SAMPLES_AT_ONCE = 4096
 _MIN_EXPLORATION = 96  # samples that every solver draws unless its own confidence is reached before
@@ -34,7 +35,7 @@ _GOLDEN = 0.618034  # its multiples are spread evenly, whatever their number
 
 @dataclass(eq=False)
 class Hypotheses(Rows):
-    """For each of B pairs a homography with λ, and how well it explains the matches."""
+    """A homography with λ for each of B pairs, and how well it explains the matches."""
 
     homography: FloatArray  # (B, 3, 3): in the half-diagonal frame
     distortion: FloatArray  # (B,)
@@ -173,7 +174,7 @@ class _SolverState:
             best.put(rows[worthwhile][better], optimized.take(better))
 
     def _best_of(self, rows: IntArray, picks: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of each pair the hypothesis that explains a part of its matches best: H, λ and cost; inf where none is."""
+        """The hypothesis of each pair that explains a part of its matches best: H, λ and cost; inf where none is."""
         _, batch, size = picks.shape
         chosen = picks.reshape(len(rows), 1, -1)
         x1, x2 = (
@@ -205,11 +206,11 @@ class _SolverState:
         The choice of the model refines the best of them again.
         """
         wide = 3.0 * self.options.threshold
-        if isinstance(self.solver.model, HomographyPairModel):
-            return self._refined(start, data, rows, self.solver.model, wide)
-        best = start
+        free, best = HomographyPairModel(), start
+        if self.solver.model == free:
+            return self._refined(start, data, rows, free, wide)
         enough = start.inliers.sum(axis=1) >= _FREE_REFINEMENT
-        for chosen, model in ((enough, HomographyPairModel()), (~enough, self.solver.model)):
+        for chosen, model in ((enough, free), (~enough, self.solver.model)):
             part = np.flatnonzero(chosen)
             if len(part):
                 refined = self._refined(best.take(part), data.take(part), rows[part], model, wide)

@@ -13,7 +13,7 @@ from rdstitch.robust.linearization import PairLenses, TransferDerivatives, diffe
 from rdstitch.robust.loss import loss_width, noise_of, robust_cost
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
-from rdstitch.robust.posterior import Prior, prior_costs, prior_slopes
+from rdstitch.robust.priors import Prior, prior_costs, prior_slopes
 
 _STATE = 9  # numbers of a state of any pair model; before these, parameters have those of the lens
 
@@ -118,7 +118,7 @@ class PairProblems:
         return np.where(possible[:, None], moved, parameters), possible
 
     def covariances(self, parameters: FloatArray, equations: PairEquations) -> FloatArray:
-        """Of the parameters where they stand, (B, P, P)."""
+        """Covariances (B, P, P) of the parameters at their present values."""
         of_matches = influence(equations.transferred, self.data.present, equations.scale, self.free > 0)
         jacobian = self.jacobian(parameters)
         return covariances(equations.information, of_matches, jacobian, equations.noise, self.data)

@@ -41,7 +41,7 @@ class Sampler:
 
 
 def _distinct(numbers: FloatArray, pool: IntArray) -> IntArray:
-    """For each sample (B, S) as many distinct integers below its ``pool`` as it has numbers in [0, 1)."""
+    """Turn numbers in [0, 1) of each sample (B, S) into as many distinct integers below its ``pool``."""
     picks = np.empty(numbers.shape, dtype=np.intp)
     for i in range(numbers.shape[-1]):
         pick = (numbers[..., i] * (pool - i)).astype(np.intp)

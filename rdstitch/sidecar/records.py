@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
-from rdstitch.choices import ProjectionName
+from rdstitch.choices import FocalSource, ProjectionName
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.camera_record import CameraRecord, FocalSource, LensRecord
+from rdstitch.geometry.camera_record import CameraRecord, LensRecord
 from rdstitch.local_alignment import DisplacementField, HeldOut
 from rdstitch.system.records import Count, Matrix, NonNegative, Pair, Size, Triple, check_invertible
 

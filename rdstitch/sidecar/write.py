@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from rdstitch.geometry.camera_record import FocalSource, camera_record, lens_fields
+from rdstitch.geometry.camera_record import camera_record, lens_fields
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
@@ -57,7 +57,7 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
         camera=camera_record(camera),
         tilt_deg=in_degrees(alignment.tilt),
         focal_px=camera.focal,
-        focal_source=cast(FocalSource | None, camera.focal_source),
+        focal_source=camera.focal_source,
         model=cast(Model, alignment.model),
         model_reason=alignment.model_reason,
         rms_px=alignment.rms,

@@ -23,7 +23,7 @@ class SampleArrays:
     """Numbers per sample: arrays whose last axis is that of the samples."""
 
     def take(self, samples: IndexArray) -> Self:
-        """Those of some samples; indices may repeat."""
+        """The arrays of some samples; indices may repeat."""
         return type(self)(*(_take(getattr(self, field.name), samples) for field in fields(self)))
 
 

@@ -34,7 +34,7 @@ class TiltRotations(SampleArrays):
 
     @classmethod
     def from_tilt(cls, tilt: ArrayLike, count: int) -> Self:
-        """From one tilt (2,), one an image (2, 2), or one a sample and image (B, 2, 2).
+        """Rotations of one tilt (2,), one an image (2, 2), or one a sample and image (B, 2, 2).
 
         ArgumentError when the shape is another, a value is not finite, or the camera does not look at the plane.
         """
@@ -56,7 +56,7 @@ class TiltRotations(SampleArrays):
         return cls(np.repeat(matrices, 2, axis=2))
 
     def take(self, samples: IndexArray) -> Self:
-        """Those of some samples; indices may repeat."""
+        """The rotations of some samples; indices may repeat."""
         return self if self.matrices.shape[-1] == 1 else super().take(samples)
 
 

@@ -79,7 +79,7 @@ class DistanceRatioEquation(SampleArrays):
 
     @classmethod
     def of(cls, difference: FloatArray, depth: FloatArray) -> "DistanceRatioEquation":
-        """From :func:`rdstitch.solvers.plane.differences` and :func:`rdstitch.solvers.plane.depths` of triangles."""
+        """Take :func:`rdstitch.solvers.plane.differences` and :func:`rdstitch.solvers.plane.depths` of triangles."""
         x, y = difference[:, 0, :, 1:], difference[:, 1, :, 1:]
         return cls(np.concatenate([x, y, depth[:, :, 1:]], axis=2).swapaxes(1, 2))
 

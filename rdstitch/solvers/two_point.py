@@ -72,7 +72,7 @@ class DistanceEquation(SampleArrays):
 
     @classmethod
     def of(cls, difference: FloatArray, depth: FloatArray) -> "DistanceEquation":
-        """From :func:`rdstitch.solvers.plane.differences` and :func:`rdstitch.solvers.plane.depths`."""
+        """The equation of :func:`rdstitch.solvers.plane.differences` and :func:`rdstitch.solvers.plane.depths`."""
         return cls(np.concatenate([difference[:, :, :, 0], depth.swapaxes(1, 2)], axis=1))
 
     def polynomial(self, distortion: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from rdstitch.alignment.given_checks import judged_focal
 from rdstitch.alignment.motion_models import LOG_HEIGHT, MODELS, MotionModel
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import ModelName
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.delays import DELAY_STD, at_delay, change_with_delay
 from rdstitch.matching.distortion_consensus import vote
@@ -67,7 +68,7 @@ class CameraKnowledge:
 
     given: AlignmentOptions
     pair: EstimationOptions  # with λ, once it is known
-    model: str  # of the motion, a word of :data:`rdstitch.choices.ModelName`
+    model: ModelName  # of the motion
     distortion: Estimate | None  # λ, half-diagonal frame; None where nothing shows it yet; std 0 where it was given
     focal: FocalLength | None = None
     shape_std: ShapeStd | None = None
@@ -124,7 +125,7 @@ class CameraKnowledge:
 
     def cameras_for(self, keyframes: Sequence[IncomingFrame], focal_std: float | None) -> list[Camera]:
         """Cameras for an alignment of keyframes, with the focal length of the map if it is to be kept so closely."""
-        cameras = [keyframe.camera.with_focal() for keyframe in keyframes]
+        cameras = [keyframe.camera.with_guessed_focal() for keyframe in keyframes]
         if self.pair.distortion is not None and not self.given.lens_known:
             cameras = [camera.with_coefficients(self.pair.distortion) for camera in cameras]
         if self.focal is None or focal_std is None:

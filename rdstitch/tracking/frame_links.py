@@ -87,7 +87,7 @@ def _registered(frame: IncomingFrame, matched: Sequence[Matched], knowledge: Cam
         # A few wrong matches do not make a link: a homography takes four of any.
         if homography is None or inliers.sum() < MIN_INLIERS + _WRONG * len(points1):
             continue
-        cameras = camera.with_focal(), camera2.with_focal()
+        cameras = camera.with_guessed_focal(), camera2.with_guessed_focal()
         relation = RadialHomography(homography, *cameras, inliers, distortion_std=0.0, model="homography")
         links.append(Link(other.number, frame.number, points1[inliers], points2[inliers], relation))
     return links

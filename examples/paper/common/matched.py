@@ -65,7 +65,7 @@ def match_files(files: Many[Path], *, ratio: float | None = None, features: int 
     pairs = []
     for k in range(len(files) - 1):
         matches = match(found[k], found[k + 1], ratio)
-        camera = Camera((images[k].shape[1], images[k].shape[0])).with_focal()
+        camera = Camera((images[k].shape[1], images[k].shape[0])).with_guessed_focal()
         name = f"{files[k].stem} and {files[k + 1].stem}"
         pairs.append(MatchedPair(name, matches.points1, matches.points2, -matches.ratio, camera))
     return pairs

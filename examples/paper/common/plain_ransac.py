@@ -13,7 +13,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver, Solve, minimal_solvers
 from rdstitch.robust.pair_models import HomographyPairModel
-from rdstitch.robust.posterior import focal_prior
+from rdstitch.robust.priors import focal_prior
 from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2
 from rdstitch.solvers import Solutions

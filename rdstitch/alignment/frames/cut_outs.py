@@ -111,5 +111,5 @@ def _powers(ratio: float) -> dict[str, float]:
 
 
 def _margin(size: Size, frame: Size) -> FloatArray:
-    """Of a frame with an image in its middle, pixels (2,)."""
+    """Margin of a frame around an image in its middle, pixels (2,)."""
     return (np.asarray(frame, dtype=np.float64) - size) / 2.0

@@ -30,7 +30,7 @@ class QuarterTurns:
 
     @classmethod
     def of(cls, sources: Sequence[Source]) -> Self:
-        """Those by which images became upright, by their headers."""
+        """The turns by which images became upright, by their headers."""
         return cls(tuple(quarter_turn(source.metadata.orientation) for source in sources))
 
     @cached_property

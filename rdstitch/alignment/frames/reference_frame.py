@@ -73,10 +73,10 @@ def stretch(fit: Fit) -> float:
     """
     if fit.model.on_sphere:
         return 1.0
-    distortion, higher, center = split_lens(fit.adjusted.parameters.lens)
+    distortion, higher, center = split_lens(fit.result.parameters.lens)
     undistorted = undistort(_GRID - center, distortion, higher)
     rays = np.column_stack([undistorted, np.ones(len(_GRID))])
-    matrices = fit.adjusted.matrices.matrices
+    matrices = fit.result.matrices.matrices
     to_plane = inverses(matrices)
     if fit.model.one_camera:
         return _ratio(rays, to_plane)

@@ -38,7 +38,7 @@ class Focal:
     log_std: float = 0.0
 
     def combined(self, log_focal: float, log_std: float) -> "Focal":
-        """With another estimate of it."""
+        """Combine it with another estimate."""
         if not self.log_std:
             return self
         weights = np.array([self.log_std, log_std]) ** -2.0
@@ -67,13 +67,13 @@ class Upright:
 
 
 def to_axes(frame: FloatArray, focal: float) -> FloatArray:
-    """From plane or directions to directions in the axes of the reference image's camera, with determinant 1."""
+    """Matrix from plane or directions to directions in the axes of the reference image's camera, with determinant 1."""
     matrix = np.diag([1.0, 1.0, focal]) @ np.linalg.inv(frame)
     return np.asarray(matrix / np.cbrt(np.linalg.det(matrix)))
 
 
 def of_rectangle(corners: FloatArray, focal: Focal, pixel: float) -> tuple[Upright, float, float]:
-    """From the corners of a rectangle in space, as Zhang and He (2007) do.
+    """Compute the upright from the corners of a rectangle in space, as Zhang and He (2007) do.
 
     ``corners`` (4, 2) are ``x``, clockwise; ``pixel`` is one in half diagonals. The focal length is the one by
     which the sides are also orthogonal; then come the aspect ratio, width by height, and its relative standard
@@ -131,7 +131,7 @@ class Edges:
 
     @classmethod
     def between(cls, ends: FloatArray, error: float, *, on_sphere: bool = False) -> Self:
-        """From their ends (N, 2, 3), ``x`` or directions, and the standard deviation of these."""
+        """Lines between their ends (N, 2, 3), ``x`` or directions, and the standard deviation of these."""
         ends = ends / (np.linalg.norm(ends, axis=2, keepdims=True) if on_sphere else ends[:, :, 2:])
         lines, middles = np.cross(ends[:, 0], ends[:, 1]), ends.sum(axis=1)
         lengths = np.linalg.norm(lines if on_sphere else lines[:, :2], axis=1)

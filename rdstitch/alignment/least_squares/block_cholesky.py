@@ -48,7 +48,7 @@ class Elimination:
 
     @classmethod
     def of(cls, count: int, image1: IntArray, image2: IntArray) -> Self:
-        """Of so many images, by links between them (L,) and (L,).
+        """The order for ``count`` images with links (L,) and (L,) between them.
 
         Of images 0-1-2-3-4 in a row, were two eliminated as one, image 3 would divide 0 1 2 from 4, and then 1 divide 0
         from 2. Fronts, the pivot first, are 0 1 and 2 1 3, whose parent is the front of 1; then 1 3 and 4 3, a batch of
@@ -83,7 +83,7 @@ class Elimination:
 
     @classmethod
     def of_links(cls, count: int, image1: IntArray, image2: IntArray) -> Self:
-        """The same; from before where these links were asked for a short while ago."""
+        """:meth:`of`, kept for links that were asked for a short while ago."""
         return cls(*_remembered(count, *(np.ascontiguousarray(ends, np.int64).tobytes() for ends in (image1, image2))))
 
     def factorized(self, diagonal: FloatArray, off_diagonal: FloatArray) -> "BlockCholesky":
@@ -178,7 +178,7 @@ def _remembered(count: int, image1: bytes, image2: bytes) -> tuple[tuple[Fronts,
 
 
 def _lower_inverse(lower: FloatArray) -> FloatArray:
-    """Of lower triangular matrices (B, K, K): of halves, where that takes fewer operations than a general inverse."""
+    """Invert lower triangular matrices (B, K, K), by halves where that takes fewer operations."""
     half = lower.shape[1] // 2
     if half < _HALVED:
         return np.asarray(np.linalg.inv(lower), dtype=np.float64)
@@ -302,7 +302,7 @@ def _coordinates(graph: "sparse.csr_array", part: IntArray) -> FloatArray:
         return lengths_of_paths
 
     def farthest(away: FloatArray) -> IntArray:
-        """Of each part the image that is farthest away."""
+        """The image of each part that is farthest away."""
         order = np.lexsort((-away, part))
         return order[np.flatnonzero(np.diff(part[order], prepend=-1))]
 

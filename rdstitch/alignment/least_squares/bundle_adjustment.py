@@ -26,14 +26,13 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.robust.levenberg_marquardt import MAX_DAMPING, damping_by_gain
 from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
-from rdstitch.robust.posterior import prior_costs, prior_slopes
+from rdstitch.robust.priors import prior_costs, prior_slopes
 
 MIN_GAIN = 1e-5
 """Expected relative fall of the loss that is worth another step: a hundredth of the noise."""
 
-FEW_GAIN, LOOSE_GAIN = 1e-4, 1e-3
-"""The same of a few matches of each pair; and where another descent goes on from there."""
-
+FEW_GAIN = 1e-4  # the same of a few matches of each pair
+LOOSE_GAIN = 1e-3  # the same where another descent goes on from there
 WIDEST_START = 0.05
 """Half diagonals: errors that a chain may have gathered before the adjustment, beyond which a link is down-weighted."""
 
@@ -85,7 +84,7 @@ class BundleAdjustmentResult:
 
     @cached_property
     def matrices(self) -> ModelMatrices:
-        """Of the images."""
+        """Homographies of the images, with their derivatives."""
         return self.adjuster.model.matrices(self.parameters.poses, self.parameters.shared)
 
     @cached_property
@@ -95,12 +94,12 @@ class BundleAdjustmentResult:
 
     @cached_property
     def errors(self) -> FloatArray:
-        """Of each correspondence (M, 2), pixels, whitened; NaN where it cannot be transferred."""
+        """Errors of the correspondences (M, 2), pixels, whitened; NaN where one cannot be transferred."""
         return whitened_errors(self.adjuster.observations, self.homographies, self.parameters.lens)
 
     @property
     def bare(self) -> Self:
-        """The same without errors and matrices, which take more memory than the rest; they can be computed again."""
+        """The result without errors and matrices, which take more memory than the rest; they can be computed again."""
         return replace(self)
 
     @property
@@ -120,7 +119,7 @@ class BundleAdjustmentResult:
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Of the model's named parameters and the free ones of the lens (S', S'), priors included."""
+        """Covariance (S', S') of the model's named parameters and the free ones of the lens, priors included."""
         return self.adjuster.covariance(self)
 
 
@@ -145,11 +144,10 @@ class _Descent:
     converged: bool
 
 
-_STEPS, _LAST_STEPS = 4, 12  # linearizations at one width of the loss, and at the last one
-
-_NARROWING, _NARROW = 3.0, 1.05
-"""By how much the loss narrows from one width to the next; widths of the last one up to which it is that."""
-
+_STEPS = 4  # linearizations at one width of the loss
+_LAST_STEPS = 12  # linearizations at the last width
+_NARROWING = 3.0  # factor by which the loss narrows from one width to the next
+_NARROW = 1.05  # last widths up to which a width is the last one
 _SETTLED = 0.02  # relative change of the errors' standard deviation that is none
 
 _FIRST_DAMPING = 1e-6
@@ -200,12 +198,12 @@ class BundleAdjuster:
         return squared_lengths(whitened_errors(self.observations, self._homographies(parameters), parameters.lens))
 
     def normal_equations(self, adjusted: BundleAdjustmentResult, width: float | None = None) -> SparseNormalEquations:
-        """At a solution, priors included; the ``width`` of the loss, pixels, follows the errors if not given."""
+        """Normal equations at a solution, with priors; ``width`` of the loss, pixels, by the errors if not given."""
         state = self.linearized(adjusted.parameters, width or ALIGNMENT_WIDTH * adjusted.sigma)
         return self._normal_equations(state, adjusted.sigma)
 
     def covariance(self, adjusted: BundleAdjustmentResult) -> FloatArray:
-        """Of the named parameters and the free ones of the lens (S', S'), as far as the overdispersion is right."""
+        """Covariance (S', S') of the named and the free lens parameters, as far as the overdispersion is right."""
         derivative = self.named_parameters(adjusted.parameters.shared)[1]
         covariance = inverse_information(self.normal_equations(adjusted).shared_information())
         named: FloatArray = derivative @ covariance @ derivative.T
@@ -253,7 +251,7 @@ class BundleAdjuster:
         return _State(parameters, matrices, homographies, equations)
 
     def _cost(self, parameters: Parameters, errors: FloatArray, sigma: float, width: float) -> float:
-        """Of errors (M, 2) at some parameters, with the priors."""
+        """Cost of errors (M, 2) at some parameters, with the priors."""
         lost = float(robust_cost(squared_lengths(errors), width).sum())
         return lost * self.weight(sigma) + self._prior_cost(parameters)
 
@@ -274,7 +272,7 @@ class BundleAdjuster:
         return min(of_most_links, WIDEST_START * float(np.median(self.observations.scale2)))
 
     def weight(self, sigma: float) -> float:
-        """Of squared errors of this scatter: one over their variance, as far as they are independent."""
+        """Weight of squared errors of this scatter: one over their variance, as far as they are independent."""
         return 1.0 / (sigma**2 * self.overdispersion)
 
     def camera_prior_cost(self, parameters: Parameters) -> float:
@@ -294,7 +292,7 @@ class BundleAdjuster:
         return known + marks.cost(matrices, parameters.lens, self.model.focal(parameters.shared))
 
     def _normal_equations(self, state: _State, sigma: float) -> SparseNormalEquations:
-        """Of the data at ``state``, and of the priors."""
+        """Normal equations of the data at ``state``, and of the priors."""
         normal = assemble(
             state.equations,
             self.observations,

@@ -26,14 +26,14 @@ class LinearResponse:
     """An adjustment, linearized at its solution."""
 
     adjuster: BundleAdjuster
-    adjusted: BundleAdjustmentResult  # of this adjuster, or of one that held a part of the lens
+    result: BundleAdjustmentResult  # of this adjuster, or of one that held a part of the lens
     weight: FloatArray  # (M,): what the square of each error counts in the normal equations
     curvature: float  # mean derivative of ``w r`` by r, in units of the mean of w: between 0 and 1
     normal: SparseNormalEquations  # with the curvature in them
 
     @classmethod
     def of(cls, adjuster: BundleAdjuster, adjusted: BundleAdjustmentResult) -> Self:
-        """At the solution."""
+        """The response at a solution."""
         width = ALIGNMENT_WIDTH * adjusted.sigma
         weight = robust_weight(adjusted.squared, width)
         curvature = float(np.clip(robust_slope(adjusted.squared, width).sum() / max(weight.sum(), 1e-300), 0.1, 1.0))
@@ -42,7 +42,7 @@ class LinearResponse:
 
     def parts(self) -> Iterator[LinearizedErrors]:
         """The errors with their derivatives, some links at a time."""
-        adjusted = self.adjusted
+        adjusted = self.result
         return linearized_errors(
             self.adjuster.observations, adjusted.homographies, adjusted.parameters.lens, self.adjuster.free.lens
         )
@@ -71,7 +71,7 @@ class LinearResponse:
         return self.normal.responses(of_poses, of_shared)
 
     def changes(self, part: LinearizedErrors, poses: FloatArray, shared: FloatArray) -> FloatArray:
-        """By how much the errors change, (m, 2, C), with steps of poses (N, D, C) and shared parameters (S, C)."""
+        """Changes of the errors (m, 2, C) with steps of poses (N, D, C) and shared parameters (S, C)."""
         o, columns = self.adjuster.observations, shared.shape[1]
         change, derivative = np.empty((*part.errors.shape, columns)), self._derivative(part)
         for link in range(part.first, part.last):
@@ -81,7 +81,7 @@ class LinearResponse:
         return change
 
     def _derivative(self, part: LinearizedErrors) -> FloatArray:
-        """Of some links' homographies and the free lens by their own parameters, see :func:`link_derivatives`."""
-        adjusted, links = self.adjusted, slice(part.first, part.last)
+        """Derivatives of some links' homographies and the free lens, see :func:`link_derivatives`."""
+        adjusted, links = self.result, slice(part.first, part.last)
         lens_count = int(self.adjuster.free.lens.sum())
         return link_derivatives(self.adjuster.observations, adjusted.matrices, adjusted.homographies, lens_count, links)

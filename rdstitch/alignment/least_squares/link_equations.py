@@ -48,7 +48,7 @@ class Lens(NamedTuple):
 
 
 def split_lens(parameters: FloatArray) -> Lens:
-    """By :data:`LENS_PARAMETERS` (5,)."""
+    """Split values of :data:`LENS_PARAMETERS` (5,)."""
     distortion, *higher = parameters[:3].tolist()
     return Lens(distortion, tuple(higher) if any(higher) else (), parameters[3:])
 

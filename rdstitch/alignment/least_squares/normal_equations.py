@@ -67,7 +67,7 @@ class SparseNormalEquations:
         information_shared: FloatArray,
         gradient_shared: FloatArray,
     ) -> Self:
-        """With priors added: on the poses as inverse variances and distances from the means, both (N, D)."""
+        """Add priors: on the poses as inverse variances and distances from the means, both (N, D)."""
         precision = np.where(self.free, precision_poses, 0.0)
         return replace(
             self,
@@ -92,7 +92,7 @@ class SparseNormalEquations:
         return np.zeros_like(self.shared)
 
     def pose_covariances(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of the inverse of the whole matrix each image's block with itself, (N, D, D), those with the shared
+        """Blocks of the inverse of the whole matrix: each image's with itself, (N, D, D), those with the shared
         parameters (N, D, S), and the one of these (S, S).
         """
         by_shared, of_shared = self.responses(np.zeros_like(self.coupling), -np.eye(len(self.shared)))

@@ -138,7 +138,7 @@ class Observations:
         return replace(self, start=start, points1=self.points1[rows], points2=self.points2[rows], relief=relief)
 
     def thinned(self, most: int) -> Self:
-        """Of each link at most about ``most`` correspondences, well spread over its overlap."""
+        """At most about ``most`` correspondences of each link, well spread over its overlap."""
         if self.most <= most:
             return self
         kept = [grid_subsample(self.points1[a:b], most) + a for a, b in itertools.pairwise(self.start)]

@@ -42,7 +42,7 @@ class ControlPoints:
 
     @classmethod
     def of(cls, sightings: Sequence[Sighting], cameras: Sequence[Camera]) -> Self:
-        """In images of these cameras."""
+        """The sightings in images of these cameras."""
         for one in sightings:
             if not 0 <= one.image < len(cameras):
                 raise ArgumentError(f"control point {one.name} is in image {one.image}, of {len(cameras)}")
@@ -62,7 +62,7 @@ class ControlPoints:
         )
 
     def within(self, images: IntArray) -> Self:
-        """In some of the images (N,), ascending, which get the numbers 0 to N - 1."""
+        """The marks in some of the images (N,), ascending, which get the numbers 0 to N - 1."""
         shown = self.subset(np.flatnonzero(np.isin(self.image, images)))
         return replace(shown, image=np.searchsorted(images, shown.image).astype(np.intp))
 

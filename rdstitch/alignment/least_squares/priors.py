@@ -1,5 +1,5 @@
 """Priors on all that an alignment adjusts, by what is given of the camera; those of the world are of
-:mod:`rdstitch.robust.posterior`.
+:mod:`rdstitch.robust.priors`.
 """
 
 import math
@@ -12,8 +12,9 @@ import numpy as np
 from rdstitch.alignment.least_squares.plane_marks import ControlPoints, PlaneMarks
 from rdstitch.alignment.motion_models import PSI, THETA, MotionModel, X, Y
 from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.choices import FocalSource
 from rdstitch.geometry.camera import LENS_PARAMETERS
-from rdstitch.robust.posterior import LENS, TILT, Prior, exact, focal_prior
+from rdstitch.robust.priors import LENS_PRIORS, TILT_PRIOR, Prior, exact, focal_prior
 
 _MOST_BARREL = 0.375
 """-λ of an equisolid fisheye with the focal length as the unit; that of a stereographic one is 1/4."""
@@ -31,7 +32,7 @@ class Priors:
 
     @cached_property
     def camera(self) -> tuple[Prior, ...]:
-        """Of the named parameters and the lens."""
+        """Priors of the named parameters and the lens."""
         return self.shared + self.lens
 
     @classmethod
@@ -47,7 +48,7 @@ class CameraPriors:
 
     log_focal: float  # log_focal, log_focal_std: of the logarithm of the focal length in half diagonals
     log_focal_std: float
-    focal_source: str  # where it comes from, a key of FOCAL_LOG_STD
+    focal_source: FocalSource
     tilt: tuple[float, float]  # (ψ, θ), radians
     tilt_known: bool
     # (N, 2): how the tilt of each image differs from the shared one, radians; zeros where that is not known
@@ -65,7 +66,7 @@ class CameraPriors:
     delayed_attitudes: FloatArray | None = None  # (N, S, 2): the attitudes, if their times are late by DELAYS
 
     def priors(self, model: MotionModel, count: int, tilt_spread: float, log_focal: float | None = None) -> Priors:
-        """For ``count`` images whose tilts scatter by ``tilt_spread`` where nothing else is known of them.
+        """Priors for ``count`` images whose tilts scatter by ``tilt_spread`` where nothing else is known of them.
 
         Tilts are turned into what they do in the images with ``log_focal``, the prior one if not given.
         """
@@ -85,21 +86,21 @@ class CameraPriors:
         return replace(known, poses=poses, poses_precision=precision, marks=self.marks)
 
     def with_lens(self, distortion: float) -> Self:
-        """With a focal length that was guessed no longer than that of a fisheye with this λ, in half diagonals."""
+        """Shorten a guessed focal length to that of a fisheye with this λ, in half diagonals."""
         if self.focal_source != "guess" or distortion >= 0.0:
             return self
         return replace(self, log_focal=min(self.log_focal, math.log(_MOST_BARREL / -distortion) / 2.0))
 
     def of_camera(self, model: MotionModel, count: int) -> Priors:
-        """For ``count`` images, nothing on their poses."""
-        tilts = map(exact, self.tilt) if self.tilt_known else (TILT, TILT)
+        """Priors for ``count`` images, with none on their poses."""
+        tilts = map(exact, self.tilt) if self.tilt_known else (TILT_PRIOR, TILT_PRIOR)
         focal_length = focal_prior(self.log_focal, self.log_focal_std, self.focal_source)
         of_name = dict(zip(("psi", "theta", "log_focal"), (*tilts, focal_length), strict=True))
         poses = np.zeros((count, model.pose_size))
-        return Priors(tuple(of_name[name] for name in model.shared_names), LENS, poses, poses)
+        return Priors(tuple(of_name[name] for name in model.shared_names), LENS_PRIORS, poses, poses)
 
     def of(self, images: IntArray) -> "CameraPriors":
-        """Of some of the images only."""
+        """The priors of some of the images only."""
         return replace(
             self,
             attitudes=self.attitudes[images],

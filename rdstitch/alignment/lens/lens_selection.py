@@ -17,10 +17,12 @@ from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjustmentR
 from rdstitch.alignment.noise import Coherence, coherence, evidence_of
 from rdstitch.alignment.pairwise import pairwise_homographies
 from rdstitch.arrays import BoolArray
+from rdstitch.choices import LensName
 from rdstitch.geometry.camera import LENS_PARAMETERS
-from rdstitch.robust.posterior import LENS, TWENTY_TO_ONE, Evidence, prior_costs
+from rdstitch.robust.posterior import Evidence
+from rdstitch.robust.priors import LENS_PRIORS, TWENTY_TO_ONE, prior_costs
 
-LENSES: dict[str, tuple[str, ...]] = {
+LENSES: dict[LensName, tuple[str, ...]] = {
     "division": ("distortion",),
     "division-center": ("distortion", "center_x", "center_y"),
     "division2": ("distortion", "distortion2", "center_x", "center_y"),
@@ -34,10 +36,11 @@ CENTER = np.array([name.startswith("center") for name in LENS_PARAMETERS])
 NO_COHERENCE = 0.3
 """Correlation of the errors of neighbours up to which nothing else can be to blame: relief leaves more."""
 
-ENOUGH_IMAGES, _ENOUGH_IMAGES_OF_A_MOTION = 4, 3
-"""Images from which on the distortion centre is freed: where every link is on its own, and where one camera explains
-all of them. In fewer a tilt and a change of height stand for it, and pairs like those of ``examples.paper figure5`` are
-registered worse with it free."""
+ENOUGH_IMAGES = 4
+"""Images from which on the distortion centre is freed where every link is on its own. In fewer a tilt and a change of
+height stand for it, and pairs like those of ``examples.paper figure5`` are registered worse with it free."""
+
+_ENOUGH_IMAGES_OF_A_MOTION = 3  # the same where one camera explains all of them
 
 _ENOUGH_LINKS = 2000
 """Of more links, evenly chosen ones say which lens it is: all of them determine it many times over, and each of the
@@ -56,7 +59,7 @@ class LensEvidence(Enum):
 class LensChoice:
     """The lens chosen."""
 
-    name: str  # a key of LENSES
+    name: LensName  # a key of LENSES
     free: BoolArray  # (5,): its parameters among LENS_PARAMETERS
     pairwise: BundleAdjustmentResult  # every link on its own with this lens
     reason: str  # one sentence
@@ -65,13 +68,20 @@ class LensChoice:
     refinements: tuple[BoolArray, ...] = ()
     evidence: LensEvidence = LensEvidence.SUFFICIENT
 
+    @classmethod
+    def held(
+        cls, pairwise: BundleAdjustmentResult, reason: str, evidence: LensEvidence = LensEvidence.SUFFICIENT
+    ) -> Self:
+        """The lens as it was before: given, or not observable."""
+        return cls("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), pairwise, reason, evidence=evidence)
+
     @property
     def observable(self) -> bool:
         """Whether λ is observable, or known."""
         return self.evidence is LensEvidence.SUFFICIENT
 
     def refined(self, free: BoolArray) -> Self:
-        """With the parameters that were freed in the end."""
+        """The choice with the parameters that were freed in the end."""
         if (free == self.free).all():
             return self
         name = next(name for name in LENSES if not (free & ~free_parameters(name)).any())
@@ -79,18 +89,13 @@ class LensChoice:
         return replace(self, name=name, free=free, reason=f"{name}: {more}")
 
 
-def free_parameters(name: str) -> BoolArray:
+def free_parameters(name: LensName) -> BoolArray:
     """Which of :data:`rdstitch.geometry.camera.LENS_PARAMETERS` a lens of the ladder has, shape (5,)."""
     return np.array([parameter in LENSES[name] for parameter in LENS_PARAMETERS])
 
 
-def choose_lens(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Sequence[str]) -> LensChoice:
-    """Choose among lenses, keys of :data:`LENSES` from the simplest; none where the lens is given.
-
-    ``pairwise`` is every link on its own with a homography, and λ free unless the lens is given.
-    """
-    if not names:
-        return LensChoice("division", np.zeros(len(LENS_PARAMETERS), dtype=np.bool_), pairwise, "given")
+def choose_lens(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Sequence[LensName]) -> LensChoice:
+    """Choose among lenses, from the simplest; ``pairwise`` is every link on its own with a homography, and λ free."""
     observations, images = links.observations, links.observations.image_count
     if len(names) > 1 and len(observations) > _ENOUGH_LINKS:
         return _choose_by_some(links, pairwise, names)
@@ -110,7 +115,7 @@ def choose_lens(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Seq
         fits.append(pairwise_homographies(links.at(fits[-1], free[index])))
         evidence = evidence_of(observations, fits[-1].errors)
         rarer = 0.0 if names[best] == "division2" else TWENTY_TO_ONE  # a series that was cut off has a next term
-        if _score(evidence, fits[index]) + rarer < _score(evidence, fits[best]):
+        if _cost(evidence, fits[index]) + rarer < _cost(evidence, fits[best]):
             best = index
     reason = _reason(names, fits, best)
     if few:
@@ -119,7 +124,7 @@ def choose_lens(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Seq
     return LensChoice(names[best], free[best], fits[best], reason, refinements)
 
 
-def _choose_by_some(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Sequence[str]) -> LensChoice:
+def _choose_by_some(links: LinkProblem, pairwise: BundleAdjustmentResult, names: Sequence[LensName]) -> LensChoice:
     """The lens that evenly chosen links show, and every link on its own with it."""
     simplest = free_parameters("division")
     some = np.arange(0, len(links.observations), -(-len(links.observations) // _ENOUGH_LINKS))
@@ -146,15 +151,15 @@ def with_third_coefficient(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     finer = free_parameters("division3")
     if problem.count < ENOUGH_IMAGES or (fit.free_lens != free_parameters("division2")).any():
         return problem, fit
-    if residual_coherence(fit.adjusted).correlation >= NO_COHERENCE:
+    if residual_coherence(fit.result).correlation >= NO_COHERENCE:
         return problem, fit
     return replace(problem, free_lens=finer), problem.extend(fit, finer)
 
 
-def _score(evidence: Evidence, fit: BundleAdjustmentResult) -> float:
+def _cost(evidence: Evidence, fit: BundleAdjustmentResult) -> float:
     """-2 log of the posterior of a lens, up to a constant."""
     parameters = int(fit.adjuster.free.lens.sum())
-    return float(evidence.score(fit.errors, parameters, prior_costs(LENS, fit.parameters.lens).sum())[0])
+    return float(evidence.cost(fit.errors, parameters, prior_costs(LENS_PRIORS, fit.parameters.lens).sum())[0])
 
 
 def _reason(names: Sequence[str], fits: Sequence[BundleAdjustmentResult], best: int) -> str:

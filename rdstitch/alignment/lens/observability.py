@@ -1,7 +1,6 @@
 """Whether the images show λ at all, or depth that looks like it; and then, which lens it is."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -17,28 +16,30 @@ from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.division_model import OBSERVABLE_STD
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.distortion_consensus import vote
-from rdstitch.robust.posterior import LENS
+from rdstitch.robust.priors import LENS_PRIORS
 
-_FEW_VIEWS, _LENS_OVER_DEPTH = 3, 6.0
-"""Images from more than which depth does not look like a lens; times by which a lens must make what neighbours share
-smaller to be no depth itself: λ takes the blame for up to 3 times what is left of depth, in 14 pairs and triples of
-published sets, and for 12 to 18 times of what fisheyes of matches leave beside λ."""
+_FEW_VIEWS = 3  # images up to which depth may look like a lens
+
+_LENS_OVER_DEPTH = 6.0
+"""Factor by which a lens must reduce what neighbours share to be no depth itself: λ takes the blame for up to 3 times
+what is left of depth, in 14 pairs and triples of published sets, and for 12 to 18 times of what fisheyes of matches
+leave beside λ."""
 
 
 def choose_observable_lens(
     task: GivenImages, sample: Observations, relations: Sequence[RadialHomography], priors: CameraPriors
 ) -> LensChoice:
-    """Of every link with a homography of its own: whether λ is seen, or could be depth, and which lens it is."""
+    """Whether links with a homography of their own show λ, or what could be depth; and which lens they show."""
 
     def links_at(lens: FloatArray, free: BoolArray) -> LinkProblem:
         return LinkProblem(sample, relations_at(sample, relations, lens), lens, free, priors)
 
-    options, first, none = task.options, np.arange(len(LENS)) == 0, np.zeros(len(LENS), dtype=np.bool_)
+    options, first, none = task.options, np.arange(len(LENS_PRIORS)) == 0, np.zeros(len(LENS_PRIORS), dtype=np.bool_)
     # The images' points are already relative to the centre of the camera.
     given = np.array([*task.cameras[0].coefficients, 0.0, 0.0])
     if options.lens_known:
         links = links_at(given, none)
-        return choose_lens(links, pairwise_homographies(links), ())
+        return LensChoice.held(pairwise_homographies(links), "given")
     votes = vote([k.relation.distortion for k in task.links], [k.relation.distortion_std for k in task.links])
     links = links_at(np.where(first, np.nan_to_num(votes.distortion), 0.0), first)
     pairwise = pairwise_homographies(links)
@@ -46,9 +47,8 @@ def choose_observable_lens(
     if sample.image_count <= _FEW_VIEWS or not moving:
         with_given_lens = pairwise_homographies(links_at(given, none))
         if not moving or _is_depth(pairwise, with_given_lens):
-            choice = choose_lens(links, with_given_lens, ())
             missing = LensEvidence.DEPTH if moving else LensEvidence.LITTLE_MOTION
-            return replace(choice, reason="λ is not observable", evidence=missing)
+            return LensChoice.held(with_given_lens, "λ is not observable", missing)
     return choose_lens(links, pairwise, options.lenses)
 
 
@@ -67,5 +67,5 @@ def _observable(pairwise: BundleAdjustmentResult) -> bool:
     """Whether one homography a pair leaves λ well determined."""
     distortion = float(pairwise.parameters.lens[0])
     # Without what the prior says.
-    information = 1.0 / float(pairwise.covariance[0, 0]) - LENS[0].curvature(distortion)
+    information = 1.0 / float(pairwise.covariance[0, 0]) - LENS_PRIORS[0].curvature(distortion)
     return bool(information > OBSERVABLE_STD**-2.0)

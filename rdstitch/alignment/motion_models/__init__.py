@@ -39,8 +39,9 @@ from rdstitch.alignment.motion_models.planar import (
     Y,
 )
 from rdstitch.alignment.motion_models.rotation import ROTATION
+from rdstitch.choices import ModelName
 
-MODELS: dict[str, MotionModel] = {model.name: model for model in (*PLANAR_MODELS, HOMOGRAPHY, ROTATION)}
+MODELS: dict[ModelName, MotionModel] = {model.name: model for model in (*PLANAR_MODELS, HOMOGRAPHY, ROTATION)}
 """All by name, in the order in which they are tried."""
 
 __all__ = [

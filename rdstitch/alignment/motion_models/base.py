@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.choices import ModelName
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +22,7 @@ class ModelMatrices:
 class MotionModel(ABC):
     """A motion model, as the adjustment uses it."""
 
-    name: str  # one word for it
+    name: ModelName
     pose_size: int  # free parameters per image, D
     shared_names: tuple[str, ...] = ()  # parameters that all images share, S of them, without those of the lens
     on_sphere: bool = False  # whether images lie around one centre, not over a plane

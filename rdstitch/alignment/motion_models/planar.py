@@ -11,6 +11,7 @@ import numpy as np
 
 from rdstitch.alignment.motion_models.base import ModelMatrices, MotionModel
 from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.choices import ModelName
 from rdstitch.geometry.planar_motion import ABOUT_X, ABOUT_Y, nearest_in_plane, rigid_in_plane, rotation_from_tilt
 from rdstitch.geometry.radial_homography import inverses
 
@@ -32,7 +33,7 @@ class PlanarModel(MotionModel):
 
     shared_names = ("psi", "theta", "log_focal")
 
-    def __init__(self, name: str, free: tuple[int, ...], *, any_tilt: bool = False) -> None:
+    def __init__(self, name: ModelName, free: tuple[int, ...], *, any_tilt: bool = False) -> None:
         self.name, self.free, self.any_tilt = name, free, any_tilt
         self.pose_size, self.free_tilts = len(free), PSI in free
 
@@ -113,7 +114,7 @@ class PlanarModel(MotionModel):
     def poses_from(
         self, other: MotionModel, poses: FloatArray, shared: FloatArray, attitudes: FloatArray
     ) -> FloatArray:
-        """Those of another planar model only change their units."""
+        """See the base class; poses of another planar model only change their units."""
         if not isinstance(other, PlanarModel):
             return super().poses_from(other, poses, shared, attitudes)
         result = poses.copy()

@@ -3,7 +3,7 @@
 import math
 from dataclasses import replace
 from importlib import import_module
-from typing import get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 import pytest
@@ -342,8 +342,8 @@ def test_mistakes_of_the_caller() -> None:
         (lambda: align(cameras, [link, link]), "same images"),
         (lambda: align(cameras[:1], [link]), "outside of the 1"),
         (lambda: align(lenses, [link], AlignmentOptions(lens_known=True)), "lenses that differ"),
-        (lambda: AlignmentOptions(model="affine"), "model must be"),
-        (lambda: AlignmentOptions(lens="brown"), "lens must be one of .*division-center"),
+        (lambda: AlignmentOptions(model=cast(Any, "affine")), "model must be"),
+        (lambda: AlignmentOptions(lens=cast(Any, "brown")), "lens must be one of .*division-center"),
         (lambda: AlignmentOptions(max_matches_per_link=4), "at least 5"),
         (lambda: replace(link, image2=0), "with itself"),
         (lambda: replace(link, points1=link.points1 * np.nan), "not finite"),
@@ -364,7 +364,7 @@ def _matched(points1: FloatArray, points2: FloatArray) -> Link:
 
 @pytest.mark.parametrize("model", ["auto", "homography"])
 @pytest.mark.parametrize("count", [20, 60])
-def test_matches_at_random_are_no_alignment(model: str, count: int) -> None:
+def test_matches_at_random_are_no_alignment(model: ModelName, count: int) -> None:
     points = np.random.default_rng(0).uniform((0.0, 0.0), (799.0, 599.0), (2, count, 2))
     link = _matched(*points)
     with pytest.raises(RegistrationError, match="no motion explains"):

@@ -103,7 +103,7 @@ def test_a_turn_that_was_asked_for_is_taken_beside_a_given_tilt() -> None:
 def test_a_focal_length_that_the_images_contradict_is_not_used(factor: float, right: bool, tilt_given: bool) -> None:
     tilt = (math.radians(8.0), math.radians(-5.0))
     given = grid_scene(4, 3, yaw=0.25, seed=3, tilt=tilt, per_link=80)
-    true = given.cameras[0].with_focal().focal
+    true = given.cameras[0].with_guessed_focal().focal
     told = [camera.with_focal(factor * true, "option") for camera in given.cameras]
     alignment = align(told, given.links, AlignmentOptions(lens="division", tilt=tilt if tilt_given else None))
     found = [message for message in alignment.messages if message.code == "focal-contradicted"]
@@ -116,7 +116,7 @@ def test_a_focal_length_that_the_images_contradict_is_not_used(factor: float, ri
 
 def test_a_focal_length_stays_given_where_no_camera_is_possible_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
     given = grid_scene(4, 3, yaw=0.25, seed=3, tilt=(0.14, -0.09), per_link=80)
-    told = [camera.with_focal(1.15 * camera.with_focal().focal, "option") for camera in given.cameras]
+    told = [camera.with_focal(1.15 * camera.with_guessed_focal().focal, "option") for camera in given.cameras]
     recipe = import_module(AlignmentTask.__module__)
 
     def build(adjusted: AdjustedImages) -> Alignment:
@@ -135,7 +135,7 @@ def test_a_focal_length_stays_given_where_no_camera_is_possible_without_it(monke
 def test_beside_a_wrong_focal_length_attitudes_are_named_only_if_they_are_wrong(sign: float, named: list[str]) -> None:
     wind = 0.1, math.radians(6.0)
     given = grid_scene(4, 3, yaw=0.25, seed=2, focal_source="exif", per_link=80, wind=wind)
-    true = given.cameras[0].with_focal().focal
+    true = given.cameras[0].with_guessed_focal().focal
     told = [camera.with_focal(1.2 * true, "option") for camera in given.cameras]
     attitudes = sign * given.poses[:, [PSI, THETA]]
     options = AlignmentOptions(lens="division", attitudes=attitudes, attitudes_std=math.radians(0.1))

@@ -297,7 +297,7 @@ def test_a_lens_that_two_images_show_stays(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_guessed_focal_length_is_that_of_fisheyes_with_as_much_barrel_distortion() -> None:
-    guessed = AlignmentOptions().camera_priors([Camera(SIZE).with_focal()])
+    guessed = AlignmentOptions().camera_priors([Camera(SIZE).with_guessed_focal()])
     equidistant = -(0.8**-2.0) / 3.0  # λ where the focal length is 0.8 half diagonals
     assert guessed.with_lens(equidistant).log_focal == pytest.approx(math.log(0.8), abs=0.1)
     for distortion in (-0.1, 0.0, 0.2):

@@ -18,8 +18,9 @@ from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import ModelName
 from rdstitch.geometry.radial_homography import inverses, project
-from rdstitch.robust.posterior import Prior
+from rdstitch.robust.priors import Prior
 
 LENS = np.array([True, True, False, False, False])
 
@@ -57,7 +58,7 @@ def test_changes_are_the_derivatives_of_the_errors(model: MotionModel) -> None:
 
 
 @pytest.mark.parametrize("model", ["similarity", "tilting"])
-def test_steps_are_what_adjusting_anew_finds(model: str) -> None:
+def test_steps_are_what_adjusting_anew_finds(model: ModelName) -> None:
     """The points of image 2 are moved by waves as large as the noise."""
     adjuster, adjusted = _adjusted(MODELS[model])
     response, observations = LinearResponse.of(adjuster, adjusted), adjuster.observations

@@ -14,6 +14,7 @@ from rdstitch.alignment.least_squares.plane_marks import Sighting
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X
 from rdstitch.alignment.near_copies import without_measurements
 from rdstitch.alignment.result import PlanarPoses
+from rdstitch.choices import ModelName
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.links import Link
 
@@ -46,7 +47,7 @@ def _without_copies(task: AlignmentTask) -> Alignment:
     ("model", "attitudes_std"),
     [("auto", 0.0), ("auto", np.radians(0.1)), ("auto", None), ("homography", None)],
 )
-def test_a_near_copy_lies_where_it_was_taken(model: str, attitudes_std: float | None) -> None:
+def test_a_near_copy_lies_where_it_was_taken(model: ModelName, attitudes_std: float | None) -> None:
     given = _scene_with_copies()
     options = AlignmentOptions(model=model, lens="division")
     if attitudes_std is not None:

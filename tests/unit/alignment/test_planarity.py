@@ -11,6 +11,7 @@ from rdstitch.alignment.noise import Coherence, coherence, evidence_of, shared_v
 from rdstitch.alignment.noise import independent_errors as independent
 from rdstitch.alignment.sentences import relief_explained
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import ModelName
 from rdstitch.robust.posterior import MODEL_ERROR
 from tests.alignment_stubs import SHIFT, independent_errors, observations
 
@@ -31,7 +32,7 @@ from tests.alignment_stubs import SHIFT, independent_errors, observations
     ],
 )
 def test_relief_needs_agreement_and_size(
-    correlation: float, relative_size: float, model: str, links: int, found: bool, says: str
+    correlation: float, relative_size: float, model: ModelName, links: int, found: bool, says: str
 ) -> None:
     for diagonal in (500.0, 2000.0):
         left = Coherence(correlation, relative_size * diagonal, relative_size)

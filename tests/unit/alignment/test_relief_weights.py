@@ -51,7 +51,7 @@ def test_heights_are_found_as_they_scatter() -> None:
     choice = choose_over_relief(problem, ModelChoice(fit, ""), ["similarity"], Purpose.MOSAIC)
     weighted = weighted_by_relief(problem, choice.fit)
     relief = weighted.observations.relief
-    noise = choice.fit.adjusted.sigma
+    noise = choice.fit.result.sigma
     o = problem.observations
     moved = np.linalg.norm(relief, axis=1) * noise
     baseline = np.linalg.norm((o.points2 - o.points1) * o.scale1[o.link, None], axis=1)
@@ -75,8 +75,8 @@ def test_a_common_displacement_adds_its_square_to_the_covariance() -> None:
 
 def test_nothing_is_the_best_of_layouts_that_nobody_would_keep() -> None:
     problem, fit = fitted(_scene(0.0))
-    steep = replace(fit.adjusted.parameters, shared=SIMILARITY.shared_from_physical(np.array([1.2, 0.0, 0.3])))
-    leaning = replace(fit, adjusted=replace(fit.adjusted, parameters=steep))
+    steep = replace(fit.result.parameters, shared=SIMILARITY.shared_from_physical(np.array([1.2, 0.0, 0.3])))
+    leaning = replace(fit, result=replace(fit.result, parameters=steep))
     for fits, purpose, found in (
         ([leaning], Purpose.MOSAIC, False),
         ([leaning], Purpose.TRAJECTORY, True),
@@ -91,15 +91,15 @@ def test_nothing_is_the_best_of_layouts_that_nobody_would_keep() -> None:
 def test_the_error_of_the_reason_is_that_of_the_fit() -> None:
     _, fit = fitted(_scene(0.0))
     choice = ModelChoice(fit, "; as requested")
-    later = replace(choice, fit=replace(fit, adjusted=replace(fit.adjusted, sigma=7.25)))
+    later = replace(choice, fit=replace(fit, result=replace(fit.result, sigma=7.25)))
     assert "7.25 pixels; as requested" in later.reason
 
 
 def test_what_did_not_converge_is_tried_from_another_start() -> None:
     problem, fit = fitted(_scene(0.0))
-    astray = replace(fit.adjusted.parameters, shared=SIMILARITY.shared_from_physical(np.array([-1.4, 0.5, 3.0])))
-    lost = replace(fit, adjusted=replace(fit.adjusted, parameters=astray, sigma=25.0, converged=False))
+    astray = replace(fit.result.parameters, shared=SIMILARITY.shared_from_physical(np.array([-1.4, 0.5, 3.0])))
+    lost = replace(fit, result=replace(fit.result, parameters=astray, sigma=25.0, converged=False))
     found = from_another_start(problem, lost)
-    assert found.adjusted.converged
-    assert found.adjusted.sigma == pytest.approx(fit.adjusted.sigma, rel=0.01)
+    assert found.result.converged
+    assert found.result.sigma == pytest.approx(fit.result.sigma, rel=0.01)
     assert from_another_start(problem, fit) is fit

@@ -97,7 +97,7 @@ def test_the_focal_length_of_a_turn_is_that_of_its_matrices_beyond_the_limits_of
 def test_a_full_turn_closes_and_gives_lens_and_focal_length() -> None:
     rng = np.random.default_rng(5)
     rotations = panorama_rotations(13, 2 * np.pi / 13, seed=5)
-    cameras = [Camera(LENS.image_size).with_focal()] * 13
+    cameras = [Camera(LENS.image_size).with_guessed_focal()] * 13
     found = align(cameras, _links(rotations, rng, noise=0.1))
     assert found.model == "rotation"
     assert found.used.all()
@@ -125,7 +125,7 @@ def test_a_turn_of_cropped_images_with_parallax_is_a_turn() -> None:
         points = link.points1[kept] - cut, link.points2[kept] - cut + parallax
         if kept.sum() >= 20:
             links.append(Link(link.image1, link.image2, *points, relation))
-    found = align([Camera((560, 420)).with_focal()] * 13, links)
+    found = align([Camera((560, 420)).with_guessed_focal()] * 13, links)
     assert found.model == "rotation"
     assert found.used.all()
     axis = np.array(LENS.center) - cut

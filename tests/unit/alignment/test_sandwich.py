@@ -18,7 +18,7 @@ from rdstitch.alignment.uncertainty import sandwich_covariances
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.geometry.radial_homography import project
-from rdstitch.robust.posterior import Prior
+from rdstitch.robust.priors import Prior
 
 LENS, NOISE = Camera((640, 480), distortion=-0.2), 0.4
 KNOWN = (Prior(), Prior(), Prior(((1.0, float(np.log(1.3)), 0.01),)))
@@ -104,8 +104,8 @@ def _variance_by_relief(columns: int, rows: int, lens: Camera | None, matches: i
     given = grid_scene(columns, rows, (0.5, 0.3), 0.2, seed=seed, per_link=matches, lens=lens)
     problem, fit = fitted(given)
     adjuster = replace(problem, free_lens=np.ones_like(problem.free_lens)).adjuster_of(fit)
-    steps, of_lens = ReliefField(LinearResponse.of(adjuster, fit.adjusted)).steps()[1], len(fit.model.shared_names)
-    return float((steps[of_lens] ** 2).sum() / adjuster.covariance(fit.adjusted)[of_lens, of_lens])
+    steps, of_lens = ReliefField(LinearResponse.of(adjuster, fit.result)).steps()[1], len(fit.model.shared_names)
+    return float((steps[of_lens] ** 2).sum() / adjuster.covariance(fit.result)[of_lens, of_lens])
 
 
 @pytest.mark.parametrize(

@@ -143,8 +143,8 @@ def _posterior(count: int) -> tuple[Posterior, Fit]:
 def test_one_camera_may_leave_what_seams_hide(stretch: float, plane: float, turn: float, chosen: str) -> None:
     posterior, fit = _posterior(3)
 
-    def hypothesis(model: MotionModel, score: float, field: float) -> Hypothesis:
-        return Hypothesis(replace(fit, model=model), score, field, stretch if model is RIGID else 1.0)
+    def hypothesis(model: MotionModel, cost: float, field: float) -> Hypothesis:
+        return Hypothesis(replace(fit, model=model), cost, field, stretch if model is RIGID else 1.0)
 
     tried = [hypothesis(ROTATION, 60.0, turn), hypothesis(RIGID, 0.0, plane), hypothesis(HOMOGRAPHY, -30.0, 0.2)]
     assert _best(posterior, tried).fit.model.name == chosen
@@ -158,8 +158,8 @@ def test_of_two_images_a_turn_is_taken_where_a_homography_is_hardly_more_probabl
 ) -> None:
     posterior, fit = _posterior(2)
     tried = [
-        Hypothesis(replace(fit, model=model), score, errors, 1.0)
-        for model, score, errors in ((ROTATION, turn, field), (RIGID, 80.0, 4.0), (HOMOGRAPHY, 0.0, 0.2))
+        Hypothesis(replace(fit, model=model), cost, errors, 1.0)
+        for model, cost, errors in ((ROTATION, turn, field), (RIGID, 80.0, 4.0), (HOMOGRAPHY, 0.0, 0.2))
     ]
     assert _best(posterior, tried).fit.model.name == chosen
 
@@ -193,15 +193,15 @@ def test_a_model_that_was_requested_is_taken() -> None:
 
 def test_the_command_decides_between_what_is_as_good(monkeypatch: pytest.MonkeyPatch) -> None:
     """`pano` is for turns, `mosaic` for planes: odds that evidence overrules."""
-    scores = []
+    costs = []
 
     def spy(problem: Problem, names: list[str], *rest: object) -> ModelChoice:
         choice = select_model(problem, ["rotation"])
-        scores.append(
-            [Posterior(problem, purpose).scored(choice.fit).score for purpose in (Purpose.PANO, Purpose.MOSAIC)]
+        costs.append(
+            [Posterior(problem, purpose).hypothesis(choice.fit).cost for purpose in (Purpose.PANO, Purpose.MOSAIC)]
         )
         return choice
 
     monkeypatch.setattr(import_module("rdstitch.alignment.recipe"), "select_model", spy)
     align(*_turn(20.0))
-    assert 2.0 < scores[0][1] - scores[0][0] < 10.0
+    assert 2.0 < costs[0][1] - costs[0][0] < 10.0

@@ -5,6 +5,7 @@ import resource
 import signal
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 
@@ -39,6 +40,30 @@ class _Strange(Exception):  # noqa: N818
 
 def fail_strangely() -> None:
     raise _Strange(1, 2)
+
+
+def only_in(process: int, content: bytes) -> bytes:
+    if os.getpid() != process:
+        raise AttributeError("cannot be loaded here")
+    return content
+
+
+class OnlyIn:
+    """What one process can load and no other."""
+
+    def __init__(self, process: int) -> None:
+        self.process = process
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return only_in, (self.process, bytes(300_000))
+
+
+def content_of(loaded: OnlyIn) -> int:
+    return loaded.process
+
+
+def only_here() -> OnlyIn:
+    return OnlyIn(os.getpid())
 
 
 def die(number: int) -> None:

@@ -64,6 +64,24 @@ def test_what_a_task_raises_is_raised_with_its_type() -> None:
         assert executor.submit(tasks.square, 3).result() == 9
 
 
+def test_what_cannot_be_loaded_costs_its_task_only() -> None:
+    with ProcessExecutor(1) as executor:
+        with pytest.raises(AttributeError, match="cannot be loaded"):
+            executor.submit(tasks.content_of, tasks.OnlyIn(os.getpid())).result(10.0)
+        assert executor.submit(tasks.square, 3).result(10.0) == 9
+        with pytest.raises(AttributeError, match="cannot be loaded"):
+            executor.submit(tasks.only_here).result(10.0)
+        assert executor.submit(tasks.square, 4).result(10.0) == 16
+
+
+def test_a_shutdown_that_does_not_wait_lets_tasks_end() -> None:
+    executor = ProcessExecutor(1)
+    running, waiting = executor.submit(tasks.process_number, 0.3), executor.submit(tasks.square, 3)
+    executor.shutdown(wait=False)
+    assert waiting.result(10.0) == 9
+    _wait_until_gone([running.result()])
+
+
 def test_a_worker_that_dies_costs_its_task_only(tmp_path: Path) -> None:
     with ProcessExecutor(2) as executor:
         done = list(in_order(executor, tasks.die_once, [tmp_path / f"{k}" if k == 3 else None for k in range(8)]))

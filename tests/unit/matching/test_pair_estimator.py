@@ -61,7 +61,7 @@ def _estimator(resting: int, moving: int, repeated: int = 0, seed: int = 0) -> P
         seen_as = names + rng.normal(scale=0.01, size=names.shape)
         inside = ((points > 0) & (points < (639, 479))).all(axis=1)
         found.append(_features(points[inside], seen_as[inside]))
-    cameras, matching = [LENS.with_focal()] * IMAGES, FeatureMatching(partial(match, ratio=None))
+    cameras, matching = [LENS.with_guessed_focal()] * IMAGES, FeatureMatching(partial(match, ratio=None))
     options, executor = EstimationOptions(select_below=50), ThreadPoolExecutor(1)
     return PairEstimator(FeatureStore.of(found), cameras, matching, options, silent, executor)
 

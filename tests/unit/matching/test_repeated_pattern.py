@@ -197,7 +197,7 @@ def test_pairs_of_a_board_are_matched_where_others_are(board: Sequence) -> None:
 
     features = FeatureStore.of([_features(board, k) for k in range(3)])
     with Counting(1) as executor:
-        cameras, options = [_LENS.with_focal()] * 3, EstimationOptions()
+        cameras, options = [_LENS.with_guessed_focal()] * 3, EstimationOptions()
         matching = FeatureMatching(match)
         estimator = PairEstimator(features, cameras, matching, options, lambda stage, *_: said.append(stage), executor)
         failed = [replace(_failed(i, j)) for i, j in ((0, 1), (1, 2))]

@@ -10,7 +10,7 @@ from examples.worlds.alignment_scenes import grid, scene
 from rdstitch.alignment import AlignmentOptions
 from rdstitch.alignment.result import Unused
 from rdstitch.arrays import FloatArray
-from rdstitch.choices import Purpose
+from rdstitch.choices import LensName, Purpose
 from rdstitch.features import Correspondences, FeatureOptions
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import write_image
@@ -153,7 +153,7 @@ def test_a_pair_that_does_not_fit_stays(curved: tuple[Aligner, list[PairRegistra
 
 
 @pytest.mark.parametrize("lens", sampled(["division", "auto"]))
-def test_only_a_rich_lens_needs_it(curved: tuple[Aligner, list[PairRegistration], list[Link]], lens: str) -> None:
+def test_only_a_rich_lens_needs_it(curved: tuple[Aligner, list[PairRegistration], list[Link]], lens: LensName) -> None:
     aligner, pairs, _ = curved
     aligner = replace(aligner, options=AlignmentOptions(lens=lens))
     aligned = aligner.draft(pairs)

@@ -18,7 +18,7 @@ def _pairs(count: int) -> list[PairMatches]:
         motion = ("rigid", "similarity", "homography")[seed % 3]
         outliers = (0.2, 0.5, 0.7)[seed % 3]
         matches = correspondences(60 + 35 * (seed % 5), seed=seed, outliers=outliers, motion=motion)
-        camera = Camera(matches.truth.camera.image_size).with_focal()
+        camera = Camera(matches.truth.camera.image_size).with_guessed_focal()
         quality = np.linspace(1.0, 0.0, len(matches.points1)) if seed % 2 else None
         pairs.append(PairMatches(matches.points1, matches.points2, camera, camera, quality))
     rng = np.random.default_rng(0)
@@ -98,7 +98,7 @@ def test_the_samples_of_a_pair_are_its_own_however_many_others_draw() -> None:
     hopeless = _pairs(1)[-2]
     for outliers in (0.42, 0.45, 0.48):
         matches = correspondences(80, seed=1, outliers=outliers, motion="homography")
-        camera = Camera(matches.truth.camera.image_size).with_focal()
+        camera = Camera(matches.truth.camera.image_size).with_guessed_focal()
         pair = PairMatches(matches.points1, matches.points2, camera, camera)
         alone, beside = (estimate_radial_homographies(pairs, options)[0] for pairs in ([pair], [pair, hopeless]))
         assert (alone.iterations, alone.homography.tobytes()) == (beside.iterations, beside.homography.tobytes())

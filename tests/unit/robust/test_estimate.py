@@ -45,7 +45,7 @@ def test_wrong_arguments_are_refused(wrong: dict[str, object], says: str) -> Non
 
 
 def test_a_pair_is_checked_where_it_is_made() -> None:
-    points, lens = MATCHES.points1, LENS.with_focal()
+    points, lens = MATCHES.points1, LENS.with_guessed_focal()
     for wrong, says in (
         ((points, points * np.nan, lens, lens), "not finite"),
         (([["a", "b"]], points, lens, lens), "points1 must be an array of numbers"),

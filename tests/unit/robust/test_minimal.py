@@ -16,7 +16,7 @@ from rdstitch.robust import SolverName, estimate_radial_homography
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import minimal_solvers
 from rdstitch.robust.per_image_distortion import PerImageDistortion, estimate_per_image_distortion
-from rdstitch.robust.posterior import focal_prior
+from rdstitch.robust.priors import focal_prior
 from rdstitch.robust.sampling import Sampler
 
 FOCAL = 1.4

@@ -19,7 +19,8 @@ from rdstitch.robust.loss import (
     sigma_of,
 )
 from rdstitch.robust.model_selection import rms_of
-from rdstitch.robust.posterior import LENS, TILT, Evidence, Prior, exact, focal_prior
+from rdstitch.robust.posterior import Evidence
+from rdstitch.robust.priors import LENS_PRIORS, TILT_PRIOR, Prior, exact, focal_prior
 from rdstitch.robust.similarity_fit import fit_similarity
 from tests.alignment_stubs import SCALE, independent_errors, observations
 
@@ -167,7 +168,7 @@ def _gain(each: int) -> float:
     """What errors that neighbours share gain by being a third smaller."""
     errors = _shared(5, each, 3.0).reshape(-1, 2)
     evidence = evidence_of(observations(errors.reshape(5, each, 2)), independent_errors(5, each, 0.2).reshape(-1, 2))
-    return float((evidence.score(errors, 0) - evidence.score(errors / 1.5, 0))[0])
+    return float((evidence.cost(errors, 0) - evidence.cost(errors / 1.5, 0))[0])
 
 
 def test_shared_errors_count_alike_however_many_matches_there_are() -> None:
@@ -181,18 +182,18 @@ def test_noise_counts_match_by_match_and_a_field_cell_by_cell() -> None:
     noise = independent_errors(links, each, 0.5).reshape(-1, 2)
     evidence = evidence_of(observations(noise.reshape(links, each, 2)), noise)
     field = _shared(links, each, 5.0).reshape(-1, 2)
-    as_noise, as_field = (math.exp((evidence.score(one, 1) - evidence.score(one, 0))[0]) for one in (noise, field))
+    as_noise, as_field = (math.exp((evidence.cost(one, 1) - evidence.cost(one, 0))[0]) for one in (noise, field))
     assert as_noise > 0.5 * 2.0 * links * each
     assert as_field < 2.5 * 16 * links
     assert evidence.field(field)[0] == pytest.approx(5.0, rel=0.5)
     assert evidence.field(noise) < 0.3
-    assert evidence.score(noise, 0) < evidence.score(field, 0)
+    assert evidence.cost(noise, 0) < evidence.cost(field, 0)
 
 
 def test_next_to_the_same_errors_cost_next_to_the_same() -> None:
     errors = (_shared(5, 300, 1.0) + independent_errors(5, 300, 1.0)).reshape(-1, 2)
     evidence = evidence_of(observations(errors.reshape(5, 300, 2)), independent_errors(5, 300, 1.0).reshape(-1, 2))
-    costs = [evidence.score(errors * size, 60)[0] for size in np.geomspace(0.5, 4.0, 400)]
+    costs = [evidence.cost(errors * size, 60)[0] for size in np.geomspace(0.5, 4.0, 400)]
     assert np.abs(np.diff(costs)).max() < 5.0
 
 
@@ -206,8 +207,8 @@ def test_what_cannot_be_transferred_counts_as_a_large_error() -> None:
     evidence = evidence_of(observations(errors.reshape(9, 60, 2)), errors)
     lost, far = errors.copy(), errors.copy()
     lost[::7], far[::7] = np.nan, 30.0 * SCALE
-    assert evidence.score(errors, 0) < evidence.score(lost, 0) < np.inf
-    assert evidence.score(far, 0) < np.inf
+    assert evidence.cost(errors, 0) < evidence.cost(lost, 0) < np.inf
+    assert evidence.cost(far, 0) < np.inf
 
 
 def test_problems_that_are_compared_together_do_not_notice_each_other() -> None:
@@ -219,14 +220,16 @@ def test_problems_that_are_compared_together_do_not_notice_each_other() -> None:
     for k in range(3):
         own = link == k
         alone = Evidence.of(link[own] * 0, points[own], np.zeros(1, dtype=np.intp), noise[[k]], scale[[k]])
-        assert alone.score(errors[own], 3)[0] == pytest.approx(together.score(errors, 3)[k])
+        assert alone.cost(errors[own], 3)[0] == pytest.approx(together.cost(errors, 3)[k])
         assert alone.field(errors[own])[0] == pytest.approx(together.field(errors)[k])
 
 
 EXIF = focal_prior(math.log(1.2), 0.05, "exif")
 
 
-@pytest.mark.parametrize("prior", [LENS[0], LENS[1], TILT, EXIF, exact(0.3)], ids=["λ", "μ", "tilt", "exif", "exact"])
+@pytest.mark.parametrize(
+    "prior", [*LENS_PRIORS[:2], TILT_PRIOR, EXIF, exact(0.3)], ids=["λ", "μ", "tilt", "exif", "exact"]
+)
 @pytest.mark.parametrize("value", [-0.7, -0.05, 0.0, 0.2, 1.1])
 def test_the_slope_is_half_the_derivative_of_the_cost(prior: Prior, value: float) -> None:
     step = 1e-7
@@ -244,26 +247,26 @@ def test_images_overrule_what_is_sometimes_wrong_but_not_what_was_given() -> Non
 
 
 def test_fisheyes_are_possible_and_strong_pincushion_is_not() -> None:
-    assert LENS[0].cost(-0.35) < 10.0
-    assert LENS[0].cost(0.2) > 20.0
-    assert LENS[0].cost(-0.02) < 1.0
+    assert LENS_PRIORS[0].cost(-0.35) < 10.0
+    assert LENS_PRIORS[0].cost(0.2) > 20.0
+    assert LENS_PRIORS[0].cost(-0.02) < 1.0
 
 
 @pytest.mark.parametrize(("value", "std", "found"), [(-0.3, 0.001, -0.3), (0.08, 0.04, 0.04), (-0.3, 0.12, -0.325)])
 def test_a_measurement_and_a_prior_meet_by_their_variances(value: float, std: float, found: float) -> None:
-    assert LENS[0].combined(value, std) == pytest.approx(found, abs=1e-4)
+    assert LENS_PRIORS[0].combined(value, std) == pytest.approx(found, abs=1e-4)
 
 
 def test_a_measurement_stands_without_a_prior_or_where_it_is_exact() -> None:
     assert Prior().combined(0.3, 1.0) == 0.3
-    assert LENS[0].combined(0.3, 0.0) == 0.3
+    assert LENS_PRIORS[0].combined(0.3, 0.0) == 0.3
 
 
 @pytest.mark.parametrize("std", [0.01, 0.03, 0.08])
 @pytest.mark.parametrize("value", [-0.14, -0.125, -0.12])
 def test_near_the_crossing_of_two_parts_they_meet_where_both_together_put_them(value: float, std: float) -> None:
-    found = LENS[0].combined(value, std)
-    assert LENS[0].slope(found) + (found - value) / std**2 == pytest.approx(0.0, abs=1e-6)
+    found = LENS_PRIORS[0].combined(value, std)
+    assert LENS_PRIORS[0].slope(found) + (found - value) / std**2 == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_singular_problem_leaves_the_others_as_if_they_were_alone() -> None:

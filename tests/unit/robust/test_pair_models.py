@@ -7,7 +7,7 @@ import pytest
 
 from rdstitch.geometry.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
-from rdstitch.robust.posterior import focal_prior
+from rdstitch.robust.priors import focal_prior
 
 MOTION = PlanarMotion((0.1, -0.15), 0.4, (0.3, -0.2), 1.15)
 K = np.diag([1.3, 1.3, 1.0])

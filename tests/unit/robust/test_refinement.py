@@ -13,7 +13,7 @@ from rdstitch.robust.covariance import covariances
 from rdstitch.robust.loss import robust_cost
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
-from rdstitch.robust.posterior import Prior, focal_prior
+from rdstitch.robust.priors import Prior, focal_prior
 from rdstitch.robust.refinement import PairProblems, refine_pairs
 
 LENS = Camera((640, 480))
