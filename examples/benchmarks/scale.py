@@ -29,7 +29,7 @@ from rdstitch.alignment import Alignment
 from rdstitch.arrays import evenly_spaced
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.frame import DeferredImage, Frame
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import DecodedImage, Metadata
 from rdstitch.io.write import write_image
@@ -141,7 +141,7 @@ def aligned_by_drawn(
     """The stages after matching that look at no pixels."""
     size, count = matches.sequence.lens.image_size, len(matches.sequence)
     metadata = Metadata(size)
-    frames = [Frame(Path(f"frame_{k:05d}.jpg"), load=_no_pixels, metadata=metadata) for k in range(count)]
+    frames = [Frame(Path(f"frame_{k:05d}.jpg"), image=DeferredImage(metadata, _no_pixels)) for k in range(count)]
     sources = read_sources(frames, skip_bad=False)[0]
     options = options.for_images(count)
     aligner = Aligner.of(sources, options, Cache())

@@ -57,24 +57,28 @@ class CornerFlow:
         if len(self._at) < _MIN_TRACKED * self.count:
             return None
         moved = np.linalg.norm(self._at - self._from, axis=1)
-        ground = ~self.is_static(self._at)
+        ground = ~is_static(self._at, frame, self.static_places)
         if (moved > _MOVED).sum() >= _SEEN_TO_MOVE:
-            places = self._places(self._at)
-            np.add.at(self._votes, places, np.where(moved <= _STILL, 1, np.where(moved > _MOVED, -1, 0)))
+            votes = np.where(moved <= _STILL, 1, np.where(moved > _MOVED, -1, 0))
+            np.add.at(self._votes, _places(self._at, frame), votes)
             self._votes = np.clip(self._votes, -_SURE, _SURE)
             ground &= moved > _STILL
         return self._from[ground], self._at[ground]
 
-    def is_static(self, points: FloatArray) -> BoolArray:
-        """Which points (N, 2) lie where corners stayed in the image while others moved: a bumper, a mast, dirt."""
-        if self._last is None or not len(points):
-            return np.zeros(len(points), dtype=np.bool_)
-        return np.asarray(self._votes[self._places(points)] >= _SURE)
+    @property
+    def static_places(self) -> BoolArray:
+        """Cells (P, P) of the image in which corners stayed while others moved: a bumper, a mast, dirt."""
+        return np.asarray(self._votes >= _SURE)
 
-    def _places(self, points: FloatArray) -> tuple[IntArray, IntArray]:
-        assert self._last is not None
-        x, y = np.clip(points * _PLACES / self._last.grey.shape[::-1], 0, _PLACES - 1).astype(np.intp).T
-        return y, x
+
+def is_static(points: FloatArray, frame: PreparedImage, static_places: BoolArray) -> BoolArray:
+    """Which points (N, 2) of a frame lie in static places, see :attr:`CornerFlow.static_places`."""
+    return np.asarray(static_places[_places(points, frame)])
+
+
+def _places(points: FloatArray, frame: PreparedImage) -> tuple[IntArray, IntArray]:
+    x, y = np.clip(points * _PLACES / frame.grey.shape[::-1], 0, _PLACES - 1).astype(np.intp).T
+    return y, x
 
 
 def corners_of(frame: PreparedImage) -> FloatArray:

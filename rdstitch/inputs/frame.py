@@ -19,17 +19,22 @@ from rdstitch.system.file_access import canonical_name, without_query
 
 
 @dataclass(frozen=True, eq=False)
+class DeferredImage:
+    """An image that is read when it is needed, and is no file of its own: a plane of several, an array on a disk."""
+
+    metadata: Metadata
+    load: Callable[[], DecodedImage]
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One input image."""
 
-    path: Path  # its file; for an array in memory the name that stands for it
+    path: Path  # its file; for an image that is no file of its own the name that stands for it
     number: int | None = None  # its number in the video, bag or list of arrays that it comes from, from 0
     timestamp: float | None = None  # when it was taken, s, where its video or bag knows that
-    image: DecodedImage | None = None  # the image itself where it is no file
-    # reads it, and what is known of it before, where neither is its file's: a plane of several, an array that is not
-    # in memory
-    load: Callable[[], DecodedImage] | None = None
-    metadata: Metadata | None = None
+    image: DecodedImage | DeferredImage | None = None  # the image itself; None: what is in its file
+    header: Metadata | None = None  # of its file, where that was read already
     # its name among images of which another one has the same file name: with folders, as many as tell them apart
     label: str = ""
 
@@ -37,6 +42,16 @@ class Frame:
     def name(self) -> str:
         """What it is called in messages, tables and files, the same in every locale."""
         return self.label or canonical_name(without_query(self.path).name)
+
+    @property
+    def metadata(self) -> Metadata | None:
+        """What is known of it so far."""
+        return self.header if self.image is None else self.image.metadata
+
+    def decoded(self) -> DecodedImage:
+        """The image itself, where it is no file of its own."""
+        assert self.image is not None
+        return self.image.load() if isinstance(self.image, DeferredImage) else self.image
 
 
 def frame_numbers(listed: Sequence[Frame]) -> list[int]:
@@ -82,7 +97,7 @@ def to_channel_order(samples: NDArray[Any], channel_order: ChannelOrder) -> NDAr
 
 def files_of(frames: Iterable[Frame]) -> list[Path]:
     """The files among the frames, which must not be overwritten."""
-    return [frame.path for frame in frames if frame.image is None and frame.load is None]
+    return [frame.path for frame in frames if frame.image is None]
 
 
 def _as_input(item: Any, index: int, channel_order: ChannelOrder) -> Named:

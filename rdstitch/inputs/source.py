@@ -59,7 +59,11 @@ class Source:
     @property
     def name(self) -> str:
         """What it is called in messages, reports and tables; see :class:`rdstitch.inputs.frame.Frame`."""
-        return (self.frame or Frame(self.path)).name
+        return self._frame.name
+
+    @property
+    def _frame(self) -> Frame:
+        return self.frame or Frame(self.path)
 
     @property
     def may_be_transparent(self) -> bool:
@@ -77,46 +81,49 @@ class Source:
 
     def number(self, position: int) -> int:
         """Its number in the video or bag that it was taken from, else its position in the sequence."""
-        return position if self.frame is None or self.frame.number is None else self.frame.number
+        return position if self._frame.number is None else self._frame.number
 
     def with_absolute_paths(self) -> Self:
-        """The same by names that hold in workers elsewhere too, where relative ones begin at other folders."""
+        """The source with absolute paths, for workers elsewhere, where relative ones begin at other folders."""
         mask = None if self.mask is None else replace(self.mask, path=self.mask.path.absolute())
-        named = is_url(self.path) or (self.frame is not None and self.frame.image is not None)
-        return replace(self, path=self.path if named else self.path.absolute(), mask=mask)
+        in_file = self._frame.image is None and not is_url(self.path)
+        return replace(self, path=self.path.absolute() if in_file else self.path, mask=mask)
 
     def content(self, cache: Cache) -> str:
         """Hash of what the image is made from, for keys of the cache; for one of this run alone its name will do."""
-        if self.frame is None or self.frame.image is None or cache.temporary is not None:
+        given = self._frame.image
+        # Planes of one file may have one name, arrays in memory have names of their own.
+        if given is None or (cache.temporary is not None and isinstance(given, DecodedImage)):
             return cache.file(self.path)
-        return cache.digest((self.frame.image.pixels, self.frame.image.alpha))
+        image = self._frame.decoded()
+        return cache.digest((image.pixels, image.alpha))
 
     def mask_content(self, cache: Cache) -> tuple[object, ...]:
-        """The same of its mask, of the image circle, and of the lens that it is resampled by."""
+        """Hash of its mask, with the image circle and the lens that it is resampled by."""
         circle = () if self.camera.image_circle is None else (*self.camera.center, self.camera.image_circle)
         resampled = (self.camera,) if self.camera.lens_model is not None else ()
         mask = (None, None) if self.mask is None else (cache.file(self.mask.path), self.mask.frame)
         return *mask, circle, *resampled
 
     def reduction(self, megapixels: float | None) -> int:
-        """By how much it can be read smaller and has no fewer pixels than an image halved to so many 10⁶ pixels."""
+        """Largest reduction that keeps at least as many pixels as an image halved to so many 10⁶ pixels has."""
         return 1 if megapixels is None else fitting_reduction(halving(self.camera.image_size, megapixels))
 
     def read(self, reduction: int = 1, *, keep: bool = False) -> DecodedImage:
-        """The pixels, of blocks of so many pixels a side; what the mask excludes is transparent."""
+        """Read the pixels, of blocks of so many pixels a side; what the mask excludes is transparent."""
         # Smaller ones are made from one size, whether that is at hand or not: the same comes out.
         usual = self.reduction(WORK_MEGAPIXELS)
         if reduction % usual:
             return self._within_circle(self._load(reduction), reduction)
-        # Frames of videos are files of their own by now, so that the path names the frame too.
-        key = (self.path, self.mask, self.flat_field, self.camera.lens_model)
+        # Frames of videos are files of their own by now, so that the path names the frame too; planes are not.
+        key = (self.path, id(self._frame.image), self.mask, self.flat_field, self.camera.lens_model)
         image = self.decoded_images.take(key) or self._load(usual)
         if keep:
             self.decoded_images.put(key, image)
         return self._within_circle(reduced(image, reduction // usual), reduction)
 
     def view(self, megapixels: float | None) -> View:
-        """What detection at so many 10⁶ pixels needs of it; it is kept for the stages that read it again."""
+        """Read what detection at so many 10⁶ pixels needs; it is kept for the stages that read it again."""
         reduction = self.reduction(megapixels)
         image = self.read(reduction, keep=True)
         # A last band of two or four would be taken for alpha there; here that is apart.
@@ -125,15 +132,12 @@ class Source:
         return View(pixels, image.alpha, reduction, self.camera.image_size)
 
     def _load(self, reduction: int) -> DecodedImage:
-        """The pixels from the file, masked."""
-        array = None if self.frame is None else self.frame.image
-        if self.frame is not None and self.frame.load is not None:
-            image = reduced(self.frame.load(), reduction)
-        elif array is None:
+        """Read the pixels, corrected and masked."""
+        if self._frame.image is None:
             with held_in_memory(self.path), self.guard.reading(self.path):
                 image = read_image(self.path, reduction, self.metadata)
         else:
-            image = reduced(array, reduction)
+            image = reduced(self._frame.decoded(), reduction)
         self.guard.check(self.path, image)
         expected = self.camera.image_size
         if image.pixels.shape[1::-1] != reduced_size(expected, reduction):
@@ -183,7 +187,7 @@ def read_sources(
         path = frame.path
         try:
             key = path.resolve()
-            metadata = frame.metadata or (read_metadata(path) if frame.image is None else frame.image.metadata)
+            metadata = frame.metadata or read_metadata(path)
             _check_memory(path, metadata, max_memory)
         except (InputError, LimitError, OSError, RuntimeError) as error:
             reason = error if isinstance(error, RdstitchError) else InputError(f"{path}: cannot be read: {error}")

@@ -130,7 +130,7 @@ class Tracker:
         matcher = partial(match, ratio=self._options.ratio)
         known = self._options.estimation, alignment_options([], self._options)
         self._frames = FrameTracker(*known, partial(_features, features), matcher, executor, patient=patient)
-        self._labels: dict[int, Pose] = {}  # of the frames that may still find their place
+        self._labels: dict[int | None, Pose] = {}  # of the frames that may still find their place
         self._numbers = count()
         self.revised: tuple[Pose, ...] = ()
         self._reported = 0  # messages that poses had

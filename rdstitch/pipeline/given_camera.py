@@ -36,7 +36,7 @@ def _stored_size(file: str | Path, inputs: Sequence[Named]) -> tuple[int, int]:
     try:
         first = find_images(inputs).frames[0]
         if first.image is not None:
-            return first.image.pixels.shape[1], first.image.pixels.shape[0]
+            return first.image.metadata.size
         metadata = read_metadata(first.path)
     except (InputError, IndexError) as error:
         raise InputError(f"{file}: has no image size; add image_width and image_height") from error

@@ -158,7 +158,7 @@ def _fits_png(source: Source) -> bool:
     """Whether PNG holds its samples; of the files that cannot be written in their own format, it holds all."""
     if source.frame is None or source.frame.image is None:
         return True
-    pixels = source.frame.image.pixels
+    pixels = source.frame.decoded().pixels
     return pixels.dtype != np.float32 and (pixels.ndim == 2 or pixels.shape[2] == 3)
 
 

@@ -62,17 +62,18 @@ class Pose:
     @property
     def unit(self) -> float:
         """How long the height of the first keyframe is: as given, else as odometry says, else one."""
-        return self.tracked.unit if self._by_odometry else self.poses.height or 1.0
+        return self.poses.height or self.tracked.unit or 1.0
 
     @property
     def _by_odometry(self) -> bool:
         """Whether odometry says how long the unit is."""
-        return not self.poses.height and math.isfinite(self.tracked.unit)
+        return not self.poses.height and self.tracked.unit is not None
 
     @property
     def length_std(self) -> float:
         """Relative standard deviation that all lengths share, by the focal length; NaN where it is not known."""
-        return self.tracked.unit_std if self._by_odometry else self.tracked.length_std
+        std = self.tracked.unit_std if self._by_odometry else self.tracked.length_std
+        return math.nan if std is None else std
 
     @property
     def position(self) -> tuple[float, float, float] | None:

@@ -177,7 +177,7 @@ def _with_header(frame: Frame) -> Frame:
     if frame.image is not None or frame.number is not None or frame.metadata is not None:
         return frame
     try:
-        return replace(frame, metadata=read_metadata(frame.path))
+        return replace(frame, header=read_metadata(frame.path))
     except InputError:
         return frame
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rdstitch.choices import ZPlane
 from rdstitch.errors import ArgumentError
-from rdstitch.inputs.frame import Frame, Named, array_as_image, as_inputs
+from rdstitch.inputs.frame import DeferredImage, Frame, Named, array_as_image, as_inputs, files_of
 from rdstitch.inputs.image_folders import READABLE_SUFFIXES, natural_key
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import DecodedImage, as_image
@@ -61,7 +61,7 @@ def _as_tile(item: Any, index: int) -> Any:
             return as_image(name, np.moveaxis(samples, 0, -1), None, metadata)
         return array_as_image(str(name), samples, "bgr")
 
-    return Frame(name, index, load=load, metadata=metadata)
+    return Frame(name, index, image=DeferredImage(metadata, load))
 
 
 def with_position_folders(inputs: Sequence[Named]) -> list[Named]:
@@ -88,7 +88,7 @@ def tile_frames(
 
     Of several z planes the brightest sample counts, and of several times the first, unless others are chosen.
     """
-    files = [frame.path for frame in frames if frame.image is None and frame.load is None]
+    files = files_of(frames)
     stored = {tile.name: tile for tile in stored_tiles(files)}
     known = {frame.path: frame for frame in frames}
     tiles = list(frames)
@@ -124,7 +124,7 @@ def _frame(tile: StoredTile, z: ZPlane, time: int) -> Frame:
         planes=channels > 1,
         channel_names=tile.channel_names,
     )
-    return Frame(tile.name, load=partial(_load, tile, z, time, metadata), metadata=metadata)
+    return Frame(tile.name, image=DeferredImage(metadata, partial(_load, tile, z, time, metadata)))
 
 
 def _load(tile: StoredTile, z: ZPlane, time: int, metadata: Metadata) -> DecodedImage:

@@ -1,65 +1,48 @@
 """Whether keyframes agree with what is given of the camera: focal length, tilt, and the times of attitudes."""
 
 import math
-from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 from rdstitch.alignment.given_checks import LATE, judged_focal
 from rdstitch.alignment.sentences import attitudes_late, focal_contradicted
 from rdstitch.results.messages import Message
 from rdstitch.tracking.camera_from_motion import CameraEstimate, SeenPairs, camera_from_motion
+from rdstitch.tracking.camera_knowledge import CameraKnowledge, Estimate, FocalLength, FocalOrigin, keeps_height
 from rdstitch.tracking.frame_links import MATCH_ERROR
 from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.metric_plane import MetricPlane
-from rdstitch.tracking.tracked_frame import Frame
+from rdstitch.tracking.tracked_frame import IncomingFrame
 
-_CHECKS = 3, 4, 6, 8, 12, 16, 32  # keyframes after the first at which a map with a plane is checked, and each _INTERVAL
-_INTERVAL = 24
+_CHECKS = 3, 4, 6, 8, 12, 16, 32  # keyframes after the first at which a map with a plane is checked
+_INTERVAL = 24  # keyframes: at multiples of it as well
 _SURER = 0.5  # of the standard deviation of all lengths that earlier frames were given with: they come again
 
 
-def check_given_camera(keyframe_map: KeyframeMap, latest: Frame, report: Callable[[Message], None]) -> bool:
-    """Adopt what the keyframes show of a camera whose lens and focal length are given, where it is time to check it.
+@dataclass(frozen=True)
+class CameraCheck:
+    """What the keyframes of a map show of a camera whose lens and focal length are given."""
 
-    True where earlier frames have other places by it, or lengths that are far surer: they come again.
-    """
-    knowledge, has_plane = keyframe_map.knowledge, keyframe_map.has_plane
-    if knowledge.focal is None or not knowledge.is_metric(latest.camera) or knowledge.model not in ("auto", "rigid"):
-        return False
-    if not keyframe_map.links or (has_plane and keyframe_map.added not in _CHECKS and keyframe_map.added % _INTERVAL):
-        return False
-    estimate, delay = _estimate(keyframe_map, knowledge.focal), knowledge.delay
-    if latest.attitude is not None:
-        knowledge.delay, knowledge.delay_std = estimate.delay, estimate.delay_std
-        if abs(estimate.delay) > LATE * estimate.delay_std:
-            report(attitudes_late(estimate.delay, estimate.delay_std))
-    if knowledge.focal_contradicted:
-        wrong = abs(estimate.log_focal) > estimate.log_focal_std
-    else:
-        knowledge.length_std, wrong = judged_focal(knowledge.stated_std, estimate.log_focal, estimate.log_focal_std)
-    scale = latest.camera.scale
-    if wrong:  # the focal length that the images show, instead of the one that was given
-        focal = knowledge.focal * math.exp(estimate.log_focal)
-        if not knowledge.focal_contradicted:
-            report(focal_contradicted(knowledge.focal * scale, focal * scale, estimate.log_focal_std))
-        knowledge.focal, knowledge.length_std, knowledge.focal_contradicted = focal, estimate.log_focal_std, True
-        knowledge.plane = MetricPlane(focal, estimate.tilt_by_itself, True, estimate.tilt_std)
-        keyframe_map.rescale(math.exp(-estimate.log_focal))
-        return True
-    if not has_plane:
-        shown = max(estimate.tilt_std, estimate.rms) * knowledge.focal * scale < MATCH_ERROR
-        if shown:
-            knowledge.plane = MetricPlane(knowledge.focal, estimate.tilt, True, estimate.tilt_std)
-            keyframe_map.rescale(1.0)
-        return shown
-    if knowledge.focal_contradicted:
-        return False
-    if abs(knowledge.delay - delay) > knowledge.delay_std:
-        keyframe_map.rescale(1.0)
-        return True
-    surer = knowledge.length_std < _SURER * knowledge.given_length_std
-    if surer:
-        knowledge.given_length_std = knowledge.length_std
-    return surer
+    knowledge: CameraKnowledge  # with that
+    messages: list[Message]
+    length_factor: float | None = None  # by which lengths change, as keyframes are placed anew; None: they stay
+    focal_replaced: bool = False  # whether motions contradict the focal length, and with it alignments under way
+    surer: bool = False  # whether lengths are far surer than earlier frames were given with
+
+    @property
+    def revises(self) -> bool:
+        """Whether earlier frames have other places, or surer ones, and come again."""
+        return self.length_factor is not None or self.surer
+
+
+def check_given_camera(keyframe_map: KeyframeMap, latest: IncomingFrame) -> CameraCheck | None:
+    """Check a given camera by the keyframes; None where nothing was given, or it is not time for that."""
+    knowledge, has_plane, added = keyframe_map.knowledge, keyframe_map.has_plane, keyframe_map.added
+    focal, model = knowledge.focal, knowledge.one_tilt_model
+    if focal is None or not knowledge.is_metric(latest.camera) or model is None or not keeps_height(model):
+        return None
+    if not keyframe_map.links or (has_plane and added not in _CHECKS and added % _INTERVAL):
+        return None
+    return _judged(knowledge, focal, latest, _estimate(keyframe_map, focal.value), has_plane=has_plane)
 
 
 def _estimate(keyframe_map: KeyframeMap, focal: float) -> CameraEstimate:
@@ -73,3 +56,46 @@ def _estimate(keyframe_map: KeyframeMap, focal: float) -> CameraEstimate:
     measured = [attitude for attitude in attitudes if attitude is not None]
     tilt = None if keyframe_map.knowledge.plane is None else keyframe_map.knowledge.plane.tilt
     return camera_from_motion(SeenPairs.of(rays, measured if len(measured) == len(rays) else []), tilt)
+
+
+def _judged(
+    knowledge: CameraKnowledge, before: FocalLength, latest: IncomingFrame, estimate: CameraEstimate, *, has_plane: bool
+) -> CameraCheck:
+    """Judge what is known, with the focal length ``before``, by an estimate from motions."""
+    delay, scale, messages = knowledge.delay, latest.camera.scale, list[Message]()
+    if latest.attitude is not None:
+        delay = Estimate(estimate.delay, estimate.delay_std)
+        if abs(delay.value) > LATE * delay.std:
+            messages.append(attitudes_late(*delay))
+    moved = abs(delay.value - knowledge.delay.value) > delay.std
+    focal = _judged_focal(before, latest.camera.focal_log_std, estimate)
+    knowledge = replace(knowledge, delay=delay, focal=focal)
+    if focal.value != before.value:
+        if before.origin is FocalOrigin.GIVEN:
+            messages.append(focal_contradicted(before.value * scale, focal.value * scale, estimate.log_focal_std))
+        plane = MetricPlane(focal.value, estimate.tilt_free_focal, True, estimate.tilt_std)
+        length_factor = math.exp(-estimate.log_focal)
+        return CameraCheck(replace(knowledge, plane=plane), messages, length_factor, focal_replaced=True)
+    if not has_plane:
+        if max(estimate.tilt_std, estimate.rms) * focal.value * scale >= MATCH_ERROR:
+            return CameraCheck(knowledge, messages)
+        plane = MetricPlane(focal.value, estimate.tilt_given_focal, True, estimate.tilt_std)
+        return CameraCheck(replace(knowledge, plane=plane), messages, 1.0)
+    if focal.origin is FocalOrigin.MOTION:
+        return CameraCheck(knowledge, messages)
+    if moved:
+        return CameraCheck(knowledge, messages, 1.0)
+    std, reported = focal.log_std, focal.reported_std
+    if std is None or reported is None or std >= _SURER * reported:
+        return CameraCheck(knowledge, messages)
+    return CameraCheck(replace(knowledge, focal=replace(focal, reported_std=std)), messages, surer=True)
+
+
+def _judged_focal(focal: FocalLength, stated_std: float, estimate: CameraEstimate) -> FocalLength:
+    """The focal length, surer by what motions show; or the one that they show, where they contradict it."""
+    log_std, contradicted = focal.log_std, abs(estimate.log_focal) > estimate.log_focal_std
+    if focal.origin is FocalOrigin.GIVEN:
+        log_std, contradicted = judged_focal(stated_std, estimate.log_focal, estimate.log_focal_std)
+    if contradicted:
+        return FocalLength(focal.value * math.exp(estimate.log_focal), estimate.log_focal_std, FocalOrigin.MOTION)
+    return replace(focal, log_std=log_std)

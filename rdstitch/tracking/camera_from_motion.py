@@ -68,12 +68,12 @@ class SeenPairs:
 class CameraEstimate:
     """What motions show of a camera."""
 
-    tilt: tuple[float, float]  # (ψ, θ), radians, with the focal length that is given
+    tilt_given_focal: tuple[float, float]  # (ψ, θ), radians, with the focal length that is given
     tilt_std: float  # of its less certain direction
     rms: float  # of the points on the plane, heights
     log_focal: float  # log of how much longer the focal length is than the given one, by the motions alone
     log_focal_std: float
-    tilt_by_itself: tuple[float, float]  # the tilt with that focal length
+    tilt_free_focal: tuple[float, float]  # (ψ, θ), radians, with the focal length that motions show
     delay: float  # s, by which times of attitudes are late; with the prior of that
     delay_std: float
 

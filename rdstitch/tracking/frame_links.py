@@ -15,11 +15,11 @@ from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.links import Link
 from rdstitch.robust import PairMatches, estimate_radial_homographies
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
-from rdstitch.tracking.tracked_frame import MIN_INLIERS, Frame, TrackedFrame
+from rdstitch.tracking.tracked_frame import MIN_INLIERS, IncomingFrame, TrackedFrame
 
 MATCH_ERROR = 1.5  # pixels by which a corner that was followed may be off the motion of the plane
-_AGREEING = 0.5  # share of the corners that must agree on it
-_WRONG = 0.05  # share of the matches that agree by chance
+_AGREEING = 0.5  # fraction of the corners that must agree on it
+_WRONG = 0.05  # fraction of the matches that agree by chance
 
 # A keyframe, its points (N, 2), those of the frame, and their quality (N,).
 Matched = tuple[TrackedFrame, FloatArray, FloatArray, FloatArray | None]
@@ -60,14 +60,14 @@ def links_by_corners(placed: TrackedFrame, others: Sequence[TrackedFrame], knowl
 
 
 def links_by_features(
-    frame: Frame, others: Sequence[TrackedFrame], match: Matcher, knowledge: CameraKnowledge
+    frame: IncomingFrame, others: Sequence[TrackedFrame], match: Matcher, knowledge: CameraKnowledge
 ) -> list[Link]:
-    """The same where nothing is known of its place."""
+    """Links of keyframes with a frame whose place is not known."""
     matched = [(other, match(other.frame.features, frame.features)) for other in others]
     return _registered(frame, [(other, m.points1, m.points2, -m.ratio) for other, m in matched], knowledge)
 
 
-def _registered(frame: Frame, matched: Sequence[Matched], knowledge: CameraKnowledge) -> list[Link]:
+def _registered(frame: IncomingFrame, matched: Sequence[Matched], knowledge: CameraKnowledge) -> list[Link]:
     if not knowledge.distortion_known:
         pairs = [
             PairMatches(points1, points2, other.frame.camera, frame.camera, quality)

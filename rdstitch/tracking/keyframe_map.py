@@ -9,11 +9,11 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.features import Matcher
 from rdstitch.matching.links import Link
-from rdstitch.tracking.camera_knowledge import CameraKnowledge
+from rdstitch.tracking.camera_knowledge import CameraKnowledge, FocalOrigin
 from rdstitch.tracking.frame_links import MATCH_ERROR, fitted_homography, links_by_corners, links_by_features
 from rdstitch.tracking.metric_plane import chained
 from rdstitch.tracking.placement import Placement, PlaneSimilarity
-from rdstitch.tracking.tracked_frame import Frame, TrackedFrame
+from rdstitch.tracking.tracked_frame import IncomingFrame, TrackedFrame
 
 _WINDOW = 48  # last keyframes, that are aligned together
 _KEPT = 200  # older keyframes at the most, among which a lost frame looks for its place
@@ -31,7 +31,7 @@ class KeyframeMap:
     The track is initialising until the map has a plane, and lost while no keyframe shows the latest frames.
     """
 
-    knowledge: CameraKnowledge
+    knowledge: CameraKnowledge  # the latest; each is a value, which nobody changes
     keyframes: list[TrackedFrame]  # the last ones
     number: int = 0  # of the map
     has_plane: bool = False  # whether keyframes lie on a plane
@@ -46,7 +46,7 @@ class KeyframeMap:
     searched: int = 0  # keyframes among which a lost frame has looked for its place
 
     def add(self, frame: TrackedFrame, links: Sequence[Link]) -> None:
-        """The next keyframe."""
+        """Add the next keyframe, and its links with others."""
         if self.between and self.between[-1][0].number == frame.number:
             self.between.pop()
         frame.keyframe = True
@@ -75,9 +75,10 @@ class KeyframeMap:
     @property
     def keeps_focal(self) -> bool:
         """Whether alignments keep the focal length: that of one map must not depend on the window."""
-        return self.knowledge.focal is not None and (self.knowledge.stated_std > 0.0 or bool(self.older))
+        focal = self.knowledge.focal
+        return focal is not None and (focal.origin is not FocalOrigin.ALIGNMENT or bool(self.older))
 
-    def links_with(self, frame: Frame, placed: TrackedFrame | None, match: Matcher) -> list[Link]:
+    def links_with(self, frame: IncomingFrame, placed: TrackedFrame | None, match: Matcher) -> list[Link]:
         """Links of a frame with the last keyframes, as far as they can be registered; of a lost one, with more."""
         last = self.keyframes[: -_PARTNERS - 1 : -1]
         if placed is not None and (links := links_by_corners(placed, last, self.knowledge)):
@@ -104,7 +105,7 @@ class KeyframeMap:
 
     @property
     def next_number(self) -> int | None:
-        """Of the map that a frame begins which none of the keyframes shows; None while it is too early for one.
+        """Number of the map that a frame begins which no keyframe shows; None while it is too early for one.
 
         A first keyframe that no frame shows is replaced.
         """
@@ -114,9 +115,9 @@ class KeyframeMap:
         return self.number + 1 if self.lost_frames >= _MAX_LOST_FRAMES and all_searched else None
 
     def place(
-        self, frame: Frame, other: TrackedFrame, before: FloatArray, now: FloatArray, *, rough: bool = False
+        self, frame: IncomingFrame, other: TrackedFrame, before: FloatArray, now: FloatArray, *, rough: bool = False
     ) -> TrackedFrame | None:
-        """A frame where it lies by points (N, 2) of a keyframe that it shows too; None where no homography fits."""
+        """Place a frame by points (N, 2) of a keyframe that it shows too; None where no homography fits."""
         start, knowledge = other.placement, self.knowledge
         camera = knowledge.camera_with_lens_of(start, frame)
         rough |= not (self.has_plane or knowledge.distortion_known)
@@ -136,8 +137,8 @@ class KeyframeMap:
             covariance = chained(other.covariance, step, (at.x - was.x, at.y - was.y), was.height)
         return TrackedFrame(frame, placement, other.aligned, covariance, inliers)
 
-    def place_by_links(self, frame: Frame, links: Sequence[Link]) -> TrackedFrame | None:
-        """A frame where it lies by the largest of its links with keyframes; None where there is none that fits."""
+    def place_by_links(self, frame: IncomingFrame, links: Sequence[Link]) -> TrackedFrame | None:
+        """Place a frame by the largest of its links with keyframes; None where there is none that fits."""
         by_number = self.by_number
         usable = [link for link in links if link.image2 == frame.number and link.image1 in by_number]
         if not usable:
@@ -155,21 +156,21 @@ class KeyframeMap:
         first.aligned = second.aligned = True
         return first
 
-    def align(self, placements: Mapping[int, Placement]) -> None:
-        """Move keyframes, by number, to where an alignment has them."""
-        self.has_plane = True
+    def align(self, placements: Mapping[int, Placement], knowledge: CameraKnowledge) -> None:
+        """Move keyframes, by number, to where an alignment has them, which shows this of the camera.
+
+        The last ones that it left out move to where their links with the others have them.
+        """
+        self.knowledge, self.has_plane = knowledge, True
         for number, keyframe in self.by_number.items():
             if number in placements:
                 keyframe.placement, keyframe.aligned, keyframe.predicted = placements[number], True, False
-
-    def follow_aligned(self, aligned: Container[int]) -> None:
-        """Move the last keyframes that an alignment left out to where their links with the others have them."""
         covariance = np.zeros((4, 4))
-        for keyframe in self.keyframes if self.knowledge.plane is not None else []:
+        for keyframe in self.keyframes if knowledge.plane is not None else []:
             if keyframe.aligned:  # without a covariance, errors grow again from that of the keyframe before
                 covariance = covariance if keyframe.covariance is None else keyframe.covariance
                 keyframe.covariance = covariance
-        self._place_again(keyframe for keyframe in self.keyframes if keyframe.number not in aligned)
+        self._place_again(keyframe for keyframe in self.keyframes if keyframe.number not in placements)
 
     def _place_again(self, keyframes: Iterable[TrackedFrame]) -> None:
         """Move keyframes, one after the other, to where their links with others have them."""
@@ -192,15 +193,14 @@ class KeyframeMap:
             keyframe.placement = enlarge.applied(keyframe.placement)
         self._place_again(others)
 
-    def revise(self, waiting: set[int] | None = None) -> list[TrackedFrame]:
-        """Place the frames between keyframes anew; of all that have a place those that were waiting, None: all."""
+    def revise(self, numbers: Container[int]) -> list[TrackedFrame]:
+        """Place frames of these numbers anew where they lie between keyframes; all of these that have a place."""
         revised = self.by_number
         for placed, keyframe, before, now in self.between:
-            if keyframe.aligned and (waiting is None or placed.number in waiting):
+            if keyframe.aligned and placed.number in numbers:
                 again = self.place(placed.frame, keyframe, before, now)
                 placed.aligned = again is not None
                 if again is not None:
                     placed.move_to(again)
                 revised.setdefault(placed.number, placed)
-        by_number = sorted(revised.items())
-        return [one for number, one in by_number if one.aligned and (waiting is None or number in waiting)]
+        return [frame for number, frame in sorted(revised.items()) if frame.aligned and number in numbers]

@@ -51,7 +51,7 @@ class MapRefinement:
         self.start_map()
 
     def start_map(self) -> None:
-        """Forget what belongs to the last map."""
+        """Forget the alignments of the last map."""
         self._next = _FIRST
         self._taken_over_at = 0  # keyframes after the first from which on the alignment is
         self.drop()
@@ -85,22 +85,22 @@ class MapRefinement:
         self._window = _Window(window, executor.submit(align, cameras, links, options), keeps_focal)
 
     def take_over(self, keyframe_map: KeyframeMap, patience: float | None) -> list[TrackedFrame]:
-        """Take over what has been aligned; frames whose places are new, those between keyframes among them.
+        """Take over what has been aligned; the frames whose places are new, those between keyframes among them.
 
-        It is waited for so many seconds at most, None for as long as it takes.
+        An alignment is waited for so many seconds at most, None for as long as it takes.
         """
         window = self._window
         if window is None or (alignment := self._finished(window, patience)) is None:
             return []
         waiting = {number for number, frame in keyframe_map.frames.items() if not frame.aligned}
         placements, length_factor = _on_map(keyframe_map, window, alignment)
-        keyframe_map.align(placements)
-        knowledge, frames = keyframe_map.knowledge, [keyframe.frame for keyframe in window.keyframes]
-        knowledge.learn(alignment, frames, keeps_focal=window.keeps_focal)
-        keyframe_map.follow_aligned(placements)
+        frames = [keyframe.frame for keyframe in window.keyframes]
+        knowledge = keyframe_map.knowledge.with_alignment(alignment, frames, keeps_focal=window.keeps_focal)
+        keyframe_map.align(placements, knowledge)
         # What was said of the lengths before is replaced, so that all lengths of a map are wrong by the same.
-        rescaled = not window.keeps_focal and abs(math.log(length_factor)) > _SAME_LENGTHS * knowledge.length_std
-        return keyframe_map.revise(None if rescaled else waiting)
+        std = None if window.keeps_focal else knowledge.length_std
+        rescaled = std is not None and abs(math.log(length_factor)) > _SAME_LENGTHS * std
+        return keyframe_map.revise(keyframe_map.frames if rescaled else waiting)
 
     def _finished(self, window: _Window, patience: float | None) -> Alignment | None:
         """The alignment of a window; None while it is under way, and, once the user knows, where there is none."""
@@ -127,11 +127,11 @@ class MapRefinement:
 
 
 def _on_map(keyframe_map: KeyframeMap, window: _Window, alignment: Alignment) -> tuple[dict[int, Placement], float]:
-    """Where keyframes, by number, lie on the map as they were aligned; by what factor lengths change."""
+    """Places of keyframes, by number, on the map as they were aligned; by what factor lengths change."""
     aligned = zip(window.keyframes, alignment.cameras, alignment.homographies, alignment.used, strict=True)
     placed = [(keyframe, Placement(camera, h, alignment.focal)) for keyframe, camera, h, used in aligned if used]
     move, length_factor = _to_map(placed)
-    first, placement = placed[0]
+    first, placement = placed[0]  # an alignment uses its reference at least
     is_first = not keyframe_map.older and first.number == keyframe_map.keyframes[0].number
     if is_first and (pose := placement.pose) is not None:
         move = PlaneSimilarity.to_origin(pose)  # the others are relative to it
@@ -139,10 +139,10 @@ def _on_map(keyframe_map: KeyframeMap, window: _Window, alignment: Alignment) ->
 
 
 def _to_map(placed: Sequence[tuple[TrackedFrame, Placement]]) -> tuple[PlaneSimilarity, float]:
-    """From the plane of an alignment to that of the map, which the first one defines; by what factor lengths change.
+    """The move from the plane of an alignment to that of the map; by what factor lengths change.
 
-    The unit of lengths is the height of the first keyframe: heights stay as they are, whatever focal length they are
-    computed by.
+    The first keyframe defines the map where there is none yet, and its height is the unit of lengths: heights stay as
+    they are, whatever focal length they are computed by.
     """
     shared = [(new, keyframe.placement) for keyframe, new in placed if keyframe.aligned]
     if not shared:

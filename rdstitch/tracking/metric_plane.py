@@ -23,12 +23,12 @@ class MetricPlane:
     rigid: bool  # whether the height stays
     tilt_std: float | None = None  # radians, by this focal length; None: exact, whatever the focal length is
 
-    def bend_std(self, length_std: float) -> float:
-        """Std of how far a path is off across, relative to its length: paths bend by what tilts are wrong by.
+    def bend_std(self, length_std: float | None) -> float:
+        """Standard deviation of a path across, relative to its length: paths bend by what tilts are wrong by.
 
         A tilt that is taken for exact belongs to a focal length that is wrong by ``length_std``.
         """
-        if self.tilt_std is not None or not math.isfinite(length_std):
+        if self.tilt_std is not None or length_std is None or not math.isfinite(length_std):
             return self.tilt_std or 0.0
         return length_std * math.hypot(*self.tilt)
 
@@ -41,10 +41,10 @@ class MetricPlane:
     def placed(
         self, frame: Placement, points: FloatArray, places: FloatArray, *, tilt_std: float = 0.0
     ) -> tuple[Placement, FloatArray]:
-        """A frame that is ``below`` at the places (N, 2) on the map of its points (N, 2), pixels.
+        """Place a frame that is ``below`` by places (N, 2) on the map of its points (N, 2), pixels; with a covariance.
 
-        And the covariance (4, 4) of its x, y, height and yaw, if the places are exact. But for the tilts: where they
-        err by ``tilt_std``, radians, from frame to frame, that turns the frame and the one that gives the places.
+        That (4, 4) is of x, y, height and yaw. It takes the places for exact, but not the tilts: where these err by
+        ``tilt_std``, radians, from frame to frame, that turns the frame and the one that gives the places.
         """
         local = frame.to_plane(points)
         moved = PlaneSimilarity.fitted(local, places, keep_size=self.rigid)
@@ -58,7 +58,7 @@ class MetricPlane:
     def _pose_covariance(
         self, local: NDArray[np.complex128], turn: complex, variance: float, tilt_std: float
     ) -> FloatArray:
-        """By places of a frame's points (N,) relative to its foot, each of them with so much variance on the map."""
+        """Covariance (4, 4) by a frame's points (N,), relative to its foot, each with so much variance on the map."""
         middle, height = complex(local.mean()), abs(turn)
         around = local - middle
         spread = max(float((abs(turn * around) ** 2).sum()), 1e-300)
@@ -77,7 +77,7 @@ class MetricPlane:
 
 
 def _squared_errors(errors: NDArray[np.complex128], points: FloatArray, image_size: tuple[int, int]) -> float:
-    """Of errors (N,) at pixels (N, 2): what those of a cell share does not become less with their number."""
+    """Sum of squared errors (N,) at pixels (N, 2): the part that a cell's errors share does not average out."""
     cell = np.floor(points * _CELLS / image_size).astype(np.intp)
     cells = np.unique(cell @ [1, 1 << 16], return_inverse=True)[1].reshape(-1)
     sums = np.bincount(cells, errors.real) ** 2 + np.bincount(cells, errors.imag) ** 2
@@ -85,7 +85,7 @@ def _squared_errors(errors: NDArray[np.complex128], points: FloatArray, image_si
 
 
 def chained(before: FloatArray, step: FloatArray, offset: tuple[float, float], height: float) -> FloatArray:
-    """The covariance (4, 4) of a frame by that of the frame that it was placed by, which is ``offset`` behind it."""
+    """Covariance (4, 4) of a frame, by ``before`` of the frame that it was placed by, which is ``offset`` behind it."""
     dx, dy = offset
     carried = np.eye(4)
     carried[[X, Y], YAW] = dy, -dx  # yaw turns the map by minus itself, y being down

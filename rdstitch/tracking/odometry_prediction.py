@@ -1,7 +1,6 @@
 """Places of frames that show no keyframe, by the wheels of the robot that carries the camera."""
 
 import cmath
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -9,7 +8,7 @@ from rdstitch.alignment.odometry import OdometryFit, motions_of
 from rdstitch.inputs.odometry import motion_between
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.placement import PlaneSimilarity
-from rdstitch.tracking.tracked_frame import Frame, TrackedFrame
+from rdstitch.tracking.tracked_frame import IncomingFrame, TrackedFrame
 
 _KEYFRAMES = 60  # the last ones, by which it is found how the camera is mounted on the body
 
@@ -22,12 +21,12 @@ class OdometryPrediction:
     latest: TrackedFrame | None = None  # of those that had a place and odometry
 
     @property
-    def unit(self) -> tuple[float, float]:
+    def unit(self) -> tuple[float, float] | tuple[None, None]:
         """Height of the first keyframe in units of the odometry, and its relative standard deviation."""
-        return (math.nan, math.nan) if self.mounted is None else (abs(self.mounted.scale), self.mounted.length_std)
+        return (None, None) if self.mounted is None else (abs(self.mounted.scale), self.mounted.length_std)
 
     def learn(self, keyframes: Iterable[TrackedFrame]) -> None:
-        """How the camera is mounted, by the keyframes of a map that images have placed."""
+        """Estimate how the camera is mounted, by the keyframes of a map that images have placed."""
         last = sorted(keyframes, key=lambda keyframe: keyframe.number)[-_KEYFRAMES:]
         # x to the right and y to the top; without a body there is no motion to or from a frame.
         poses = [
@@ -37,8 +36,8 @@ class OdometryPrediction:
         ]
         self.mounted = OdometryFit.of(motions_of(poses)) or self.mounted
 
-    def place(self, frame: Frame, knowledge: CameraKnowledge) -> TrackedFrame | None:
-        """A frame where it lies by its way from the latest one; None where that is not known."""
+    def place(self, frame: IncomingFrame, knowledge: CameraKnowledge) -> TrackedFrame | None:
+        """Place a frame by its way from the latest one; None where that is not known."""
         last, fit = self.latest, self.mounted
         if last is None or fit is None or frame.body is None or last.frame.body is None or knowledge.plane is None:
             return None

@@ -2,30 +2,31 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.features import Features
-from rdstitch.features.corner_flow import corners_of
+from rdstitch.features.corner_flow import corners_of, is_static
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import from_plane
 from rdstitch.inputs.odometry import BodyPose
 from rdstitch.tracking.placement import CameraPose, Placement
+from rdstitch.tracking.tracking_state import TrackingState
 
-MIN_INLIERS = 15
+MIN_INLIERS = 15  # matches by which a frame is placed or linked
 _GRID = 8  # points a side by which it is measured how much two frames share
-NO_IMAGE = prepare(View(np.zeros((1, 1), np.uint8)), None)  # of frames that are not looked at again
+_NO_IMAGE = prepare(View(np.zeros((1, 1), np.uint8)), None)
 
 
 @dataclass(frozen=True)
 class TrackingResult:
     """The result of one frame."""
 
-    number: int = -1  # of the frame, in the order of arrival; -1 where it could not be read
+    number: int | None = None  # of the frame, in the order of arrival; None where it could not be read
     placement: Placement | None = None  # where it lies on the plane of its map; None where that is not known
     distortion: float = math.nan  # λ by all frames up to this one, half-diagonal frame; NaN where it cannot be seen
     distortion_std: float = math.inf
@@ -34,14 +35,19 @@ class TrackingResult:
     keyframe: bool = False
     inliers: int = 0  # matches with the last keyframes that agree
     revised: bool = False  # whether the frame had come before, and has its place, or another one, only now
-    quality: float = 0.0  # share of the matches that agree
+    quality: float = 0.0  # fraction of the matches that agree
     # (4, 4): of x, y, height and yaw, in units of the first keyframe's height and radians, relative to that; without
     # what all lengths share. None where there is no metric pose
     covariance: FloatArray | None = field(default=None, repr=False, compare=False)
-    length_std: float = math.nan  # relative standard deviation that all lengths share
-    unit: float = math.nan  # height of the first keyframe by odometry
-    unit_std: float = math.nan  # relative
-    reason: str = ""  # why there is no place; empty where there is one
+    length_std: float | None = None  # relative standard deviation that all lengths share
+    unit: float | None = None  # height of the first keyframe by odometry
+    unit_std: float | None = None  # relative
+    state: TrackingState = TrackingState.UNREAD
+
+    @property
+    def reason(self) -> str:
+        """Why there is no place; empty where there is one."""
+        return self.state.value
 
     @property
     def pose(self) -> CameraPose | None:
@@ -50,8 +56,8 @@ class TrackingResult:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
-    """A frame as it came."""
+class IncomingFrame:
+    """A frame as it came, with what was measured at its time."""
 
     number: int
     camera: Camera
@@ -59,32 +65,40 @@ class Frame:
     detect: Callable[[PreparedImage], Features]
     attitude: FloatArray | None = None  # (S, 2): (ψ, θ) as measured at DELAYS, radians
     body: BodyPose | None = None  # by odometry
-    # which points (N, 2) do not move with the floor
-    static: Callable[[FloatArray], BoolArray] = lambda points: np.zeros(len(points), dtype=np.bool_)
+    static_places: BoolArray | None = None  # (P, P): cells of the image that do not move with the floor
 
     @cached_property
     def corners(self) -> FloatArray:
-        """Corners (N, 2), by which it is matched where one knows about where it lies."""
+        """Corners (N, 2), by which it is matched where its place is about known."""
         corners = corners_of(self.image)
-        return corners[~self.static(corners)]
+        return corners[self._on_floor(corners)]
 
     @cached_property
     def features(self) -> Features:
-        """Features, by which it is matched where one does not."""
+        """Features, by which it is matched where its place is not known."""
         features = self.detect(self.image)
-        return features.take(np.flatnonzero(~self.static(features.points)))
+        return features.take(self._on_floor(features.points))
+
+    def _on_floor(self, points: FloatArray) -> IntArray:
+        """Indices of the points (N, 2) that may move with the floor."""
+        places = self.static_places
+        return np.arange(len(points)) if places is None else np.flatnonzero(~is_static(points, self.image, places))
 
     @property
     def textured(self) -> bool:
         """Whether it shows enough to be placed by."""
         return len(self.corners) >= MIN_INLIERS or len(self.features) >= MIN_INLIERS
 
+    def without_image(self) -> "IncomingFrame":
+        """The frame once its corners and features are no longer needed."""
+        return replace(self, image=_NO_IMAGE)
+
 
 @dataclass(eq=False)
 class TrackedFrame:
     """A frame with its place relative to the keyframes, which its map may revise."""
 
-    frame: Frame
+    frame: IncomingFrame
     placement: Placement
     aligned: bool = False  # whether that is on the plane of the map
     covariance: FloatArray | None = None  # (4, 4): of x, y, height and yaw; None: not known
@@ -94,7 +108,7 @@ class TrackedFrame:
 
     @property
     def quality(self) -> float:
-        """Share of the matches that agree; 0 without any."""
+        """Fraction of the matches that agree; 0 without any."""
         return float(self.inliers.mean()) if len(self.inliers) else 0.0
 
     @property
@@ -109,7 +123,7 @@ class TrackedFrame:
 
     @property
     def number(self) -> int:
-        """That of the frame."""
+        """Number of the frame, in the order of arrival."""
         return self.frame.number
 
     def points_in(self, other: "TrackedFrame", points: FloatArray) -> FloatArray:
@@ -118,7 +132,7 @@ class TrackedFrame:
         return from_plane(there.camera, there.homography, self.placement.to_plane(points))
 
     def overlap_with(self, other: "TrackedFrame") -> float:
-        """Share of the frame that another one shows."""
+        """Fraction of the frame that another one shows."""
         axes = [(np.arange(_GRID) + 0.5) * side / _GRID - 0.5 for side in self.frame.camera.image_size]
         points = self.points_in(other, np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2))
         inside = (points >= 0.0).all(axis=1) & (points <= np.array(other.frame.camera.image_size) - 1.0).all(axis=1)

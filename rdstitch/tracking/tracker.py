@@ -1,5 +1,6 @@
 """The tracker: a frame comes in, its place on the plane comes out."""
 
+import math
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from dataclasses import replace
@@ -24,10 +25,15 @@ from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.map_refinement import MapRefinement
 from rdstitch.tracking.odometry_prediction import OdometryPrediction
 from rdstitch.tracking.placement import Placement
-from rdstitch.tracking.tracked_frame import NO_IMAGE, Frame, TrackedFrame, TrackingResult
+from rdstitch.tracking.tracked_frame import IncomingFrame, TrackedFrame, TrackingResult
+from rdstitch.tracking.tracking_state import TrackingState
 
 _PATIENCE = 0.015  # seconds a frame that are waited for the first alignment
-_KEYFRAME_OVERLAP = 0.8  # share of a frame that its last keyframe shows, below which it becomes a keyframe
+_KEYFRAME_OVERLAP = 0.8  # fraction of a frame that its last keyframe shows, below which it becomes a keyframe
+
+
+Followed = tuple[FloatArray, FloatArray] | None
+"""Corners (N, 2) of the last keyframe, before and now; None where too few could be followed."""
 
 
 class FrameTracker:
@@ -51,9 +57,8 @@ class FrameTracker:
     ) -> None:
         self._detect, self._match, self._count = detect, match, 0
         self.messages: list[Message] = []  # what the user should know of what has come so far
-        self._knowledge = CameraKnowledge.of(alignment, pair)
         self._flow, self._odometry = CornerFlow(), OdometryPrediction()
-        self._map = KeyframeMap(self._knowledge, [])
+        self._map = KeyframeMap(CameraKnowledge.of(alignment, pair), [])
         self._refinement = MapRefinement(executor, patient=patient, report=self._report)
 
     @property
@@ -69,59 +74,60 @@ class FrameTracker:
         ``camera`` is of the size of ``image``; ``attitude`` (S, 2) is ψ and θ, radians, as they were measured at
         :data:`rdstitch.inputs.delays.DELAYS`; ``body`` is by odometry.
         """
-        frame = Frame(self._count, camera, image, self._detect, attitude, body, self._flow.is_static)
+        followed = self._flow.follow(image)
+        frame = IncomingFrame(self._count, camera, image, self._detect, attitude, body, self._flow.static_places)
         self._count += 1
         if not self._map.keyframes:
             return [self._first(frame, 0)]
         patience = 0.0 if self._map.has_plane else _PATIENCE
         revised = [] if self._refinement.patient else self._take_over(None, patience)
-        return [*revised, *self._registered(frame)]
+        return [*revised, *self._registered(frame, followed)]
 
     def finish(self) -> list[TrackingResult]:
         """Frames that find their place, or another one, when no other frame comes."""
         results, keyframe_map = self._take_over(None, None), self._map
-        refinable = not keyframe_map.has_plane or self._knowledge.plane is not None
+        refinable = not keyframe_map.has_plane or keyframe_map.knowledge.plane is not None
         if len(keyframe_map.keyframes) > 1 and not keyframe_map.keeps_focal and refinable:
             self._refinement.begin(keyframe_map)
             results += self._take_over(None, None)
         return list({result.number: result for result in results}.values())
 
-    def _registered(self, frame: Frame) -> list[TrackingResult]:
-        """By the corners that were followed, else by links with keyframes, else by odometry."""
-        placed, links = self._follow(frame), list[Link]()
+    def _registered(self, frame: IncomingFrame, followed: Followed) -> list[TrackingResult]:
+        """Place a frame by the corners that were followed, else by links with keyframes, else by odometry."""
+        placed, links = self._place_followed(frame, followed), list[Link]()
         if placed is None or self._is_new(placed):
             links = self._map.links_with(frame, placed, self._match)
             placed = self._map.place_by_links(frame, links) or placed
         if placed is not None:
             results = self._placed(placed, links)
-        elif (placed := self._odometry.place(frame, self._knowledge)) is not None:
+        elif (placed := self._odometry.place(frame, self._map.knowledge)) is not None:
             results = self._predicted(placed)
         else:
             return [self._without_place(frame)]
         if placed.pose is not None and frame.body is not None:
             self._odometry.latest = placed
         if not placed.keyframe:
-            placed.frame = replace(frame, image=NO_IMAGE)
+            placed.frame = frame.without_image()
         return results
 
-    def _first(self, frame: Frame, map_number: int) -> TrackingResult:
-        """The first keyframe of a map."""
-        knowledge, self._odometry.latest = self._knowledge, None
+    def _first(self, frame: IncomingFrame, map_number: int) -> TrackingResult:
+        """Begin a map with its first keyframe."""
+        knowledge, self._odometry.latest = self._map.knowledge, None
         camera = knowledge.camera_of(frame)
         first = TrackedFrame(frame, Placement(camera, np.eye(3), None), keyframe=True)
         if knowledge.plane is None:
-            knowledge.adopt_given(frame.camera)
+            knowledge = knowledge.with_given_focal(frame.camera)
         if knowledge.plane is not None:
             first.placement = knowledge.plane.below(camera, knowledge.attitude(frame))
             first.covariance = np.zeros((4, 4))
         self._map = KeyframeMap(knowledge, [first], map_number)
         self._refinement.start_map()
         self._flow.begin(frame.image, frame.corners)
-        reason = "first frame" if not map_number else "no keyframe shows what it shows: it begins a new map"
-        return self._result(first, reason=reason if frame.textured else "no floor texture")
+        state = TrackingState.NEW_MAP if map_number else TrackingState.FIRST
+        return self._result(first, state=state if frame.textured else TrackingState.NO_TEXTURE)
 
     def _placed(self, placed: TrackedFrame, links: list[Link]) -> list[TrackingResult]:
-        """A frame that keyframes show; where it has links and shows anything new, it is the next keyframe."""
+        """Keep a frame that keyframes show; where it has links and shows anything new, it is the next keyframe."""
         self._map.lost_frames = 0
         inliers, last = int(placed.inliers.sum()), self._map.keyframes[-1].number
         shown = next((link for link in links if link.image1 == last), None)
@@ -136,10 +142,10 @@ class FrameTracker:
             results += [] if between else self._add_keyframe(placed, links)
         return [*results, self._result(placed, inliers)]
 
-    def _follow(self, frame: Frame) -> TrackedFrame | None:
-        """The frame at its place by the corners of the last keyframe; None where too few of them agree on one."""
-        matched, last = self._flow.follow(frame.image), self._map.keyframes[-1]
-        placed = None if matched is None else self._map.place(frame, last, *matched, rough=True)
+    def _place_followed(self, frame: IncomingFrame, followed: Followed) -> TrackedFrame | None:
+        """Place a frame by the corners of the last keyframe; None where too few of them agree on a place."""
+        last = self._map.keyframes[-1]
+        placed = None if followed is None else self._map.place(frame, last, *followed, rough=True)
         if placed is None or not agree(placed.inliers):
             return None
         # Where the view turns, what is followed from frame to frame drifts.
@@ -153,21 +159,21 @@ class FrameTracker:
         return placed
 
     def _predicted(self, placed: TrackedFrame) -> list[TrackingResult]:
-        """A frame placed by odometry, as the next keyframe where it shows anything new."""
+        """Keep a frame that odometry placed, as the next keyframe where it shows anything new."""
         revised = list[TrackingResult]()
         if placed.frame.textured and self._is_new(placed):
             self._map.lost_frames = 0
             revised = self._add_keyframe(placed, [])
         return [*revised, self._result(placed)]
 
-    def _without_place(self, frame: Frame) -> TrackingResult:
-        """A frame that no keyframe shows; after many of them, a new map begins with the last."""
+    def _without_place(self, frame: IncomingFrame) -> TrackingResult:
+        """Count a frame that no keyframe shows; after many of them, a new map begins with the last."""
         self._map.lost_frames += 1
         if not frame.textured:
-            return self._unplaced(frame, "no floor texture")
+            return self._unplaced(frame, TrackingState.NO_TEXTURE)
         if (map_number := self._map.next_number) is not None:
             return self._first(frame, map_number)
-        return self._unplaced(frame, "no keyframe shows what it shows")
+        return self._unplaced(frame, TrackingState.LOST)
 
     def _is_new(self, placed: TrackedFrame) -> bool:
         """Whether the last keyframe shows too little of it."""
@@ -178,7 +184,7 @@ class FrameTracker:
         self._flow.begin(placed.frame.image, placed.frame.corners)
         self._map.add(placed, links)
         if not self._map.has_plane:
-            self._knowledge.vote(self._map.links)
+            self._map.knowledge = self._map.knowledge.with_votes(self._map.links)
         revised = self._with_checked_camera(placed)
         if placed.frame.body is not None:
             self._odometry.learn(self._map.by_number.values())
@@ -188,12 +194,18 @@ class FrameTracker:
         return revised
 
     def _with_checked_camera(self, latest: TrackedFrame) -> list[TrackingResult]:
-        """Earlier frames whose places are others, or surer, by what keyframes show of a camera that was given."""
-        focal = self._knowledge.focal
-        changed = check_given_camera(self._map, latest.frame, self._report)
-        if self._knowledge.focal != focal:
+        """Adopt what keyframes show of a given camera; earlier frames whose places are others by it, or surer."""
+        keyframe_map, check = self._map, check_given_camera(self._map, latest.frame)
+        if check is None:
+            return []
+        for message in check.messages:
+            self._report(message)
+        if check.focal_replaced:
             self._refinement.drop()
-        return self._revised(self._map.revise(), latest) if changed else []
+        keyframe_map.knowledge = check.knowledge
+        if check.length_factor is not None:
+            keyframe_map.rescale(check.length_factor)
+        return self._revised(keyframe_map.revise(keyframe_map.frames), latest) if check.revises else []
 
     def _take_over(self, latest: TrackedFrame | None, patience: float | None) -> list[TrackingResult]:
         return self._revised(self._refinement.take_over(self._map, patience), latest)
@@ -208,38 +220,42 @@ class FrameTracker:
             self.messages.append(message)
 
     def _result(
-        self, placed: TrackedFrame, inliers: int = 0, *, reason: str = "", revised: bool = False
+        self, placed: TrackedFrame, inliers: int = 0, *, state: TrackingState | None = None, revised: bool = False
     ) -> TrackingResult:
         pose = placed.pose
-        if not placed.aligned and not reason:
-            moved = len(self._map.keyframes) > 1 or placed.keyframe
-            reason = "the first keyframes are being aligned" if moved else "the camera has not moved far enough yet"
-            if self._map.has_plane:
-                reason = "it is not linked with the map yet"
-        elif placed.aligned and pose is None:
-            metric = placed.placement.focal is not None
-            reason = "its place is not finite" if metric else "the model has no metric poses"
         return replace(
-            self._unplaced(placed.frame, reason),
+            self._unplaced(placed.frame, self._state_of(placed) if state is None else state),
             placement=placed.placement if placed.aligned else None,
             keyframe=placed.keyframe,
             inliers=inliers,
             revised=revised,
             quality=placed.quality,
-            covariance=None if pose is None else self._knowledge.covariance(placed, pose),
+            covariance=None if pose is None else self._map.knowledge.covariance(placed, pose),
         )
 
-    def _unplaced(self, frame: Frame, reason: str) -> TrackingResult:
-        """A frame without a place, and what is known of its camera."""
-        knowledge, (unit, unit_std) = self._knowledge, self._odometry.unit
+    def _state_of(self, placed: TrackedFrame) -> TrackingState:
+        """The state of a frame that was placed by others."""
+        if placed.pose is not None:
+            return TrackingState.TRACKED
+        if placed.aligned:
+            return TrackingState.NO_METRIC_POSE if placed.placement.focal is None else TrackingState.NOT_FINITE
+        if self._map.has_plane:
+            return TrackingState.NOT_LINKED
+        moved = len(self._map.keyframes) > 1 or placed.keyframe
+        return TrackingState.INITIALISING if moved else TrackingState.NOT_MOVED
+
+    def _unplaced(self, frame: IncomingFrame, state: TrackingState) -> TrackingResult:
+        """The result of a frame without a place: what is known of its camera."""
+        knowledge, (unit, unit_std) = self._map.knowledge, self._odometry.unit
+        known = knowledge.distortion
         return TrackingResult(
             number=frame.number,
-            distortion=knowledge.distortion,
-            distortion_std=knowledge.distortion_std,
+            state=state,
+            distortion=math.nan if known is None else known.value,
+            distortion_std=math.inf if known is None else known.std,
             distortion_known=knowledge.distortion_known,
             map_number=self._map.number,
             length_std=knowledge.length_std,
             unit=unit,
             unit_std=unit_std,
-            reason=reason,
         )

@@ -61,14 +61,14 @@ def test_images_of_pillow_are_in_their_own_colours(frames: list[Path], of_files:
     for image, frame in zip(images, frames, strict=True):
         (found,) = as_inputs(image)
         assert isinstance(found, Frame)
-        np.testing.assert_array_equal(found.image.pixels, rdstitch.io.read_image(frame).pixels)
+        np.testing.assert_array_equal(found.decoded().pixels, rdstitch.io.read_image(frame).pixels)
     result = rdstitch.pano(images, options=_OPTIONS)
     np.testing.assert_array_equal(result.image, of_files.image)
     sideways = images[0].copy()
     sideways.getexif()[0x0112] = 6
     (turned,) = as_inputs(sideways)
     assert isinstance(turned, Frame)
-    assert turned.image.pixels.shape[:2] == sideways.size
+    assert turned.decoded().pixels.shape[:2] == sideways.size
 
 
 def test_tensors_are_refused_with_the_remedy() -> None:
@@ -159,10 +159,11 @@ def test_shapes_and_types(
 ) -> None:
     (frame,) = as_inputs(np.zeros(shape, dtype))
     assert isinstance(frame, Frame)
-    assert frame.image.pixels.shape == pixels
-    assert frame.image.pixels.dtype == (np.float32 if dtype is np.float64 else dtype)
-    assert (None if frame.image.alpha is None else frame.image.alpha.shape) == alpha
-    assert frame.image.metadata.size == (5, 4)
+    image = frame.decoded()
+    assert image.pixels.shape == pixels
+    assert image.pixels.dtype == (np.float32 if dtype is np.float64 else dtype)
+    assert (None if image.alpha is None else image.alpha.shape) == alpha
+    assert image.metadata.size == (5, 4)
     assert len(as_inputs(np.zeros((3, 4, 5, 3), np.uint8))) == 3
 
 

@@ -114,8 +114,8 @@ def test_what_is_no_fault_of_the_bag_is_not_called_one(tmp_path: Path, error: Ex
         raise error
 
 
-@pytest.mark.parametrize(("height", "unit"), [(None, 0.5), (2.0, 0.5), (2.0, np.nan)])
-def test_a_height_by_odometry_is_as_sure_as_all_its_lengths(height: float | None, unit: float) -> None:
+@pytest.mark.parametrize(("height", "unit"), [(None, 0.5), (2.0, 0.5), (2.0, None)])
+def test_a_height_by_odometry_is_as_sure_as_all_its_lengths(height: float | None, unit: float | None) -> None:
     away = Placement(CAMERA, np.array([[1.0, 0.0, 3.0], [0.0, 1.0, 4.0], [0.0, 0.0, 1.0]]), 1.0)
     tracked = TrackingResult(placement=away, covariance=np.zeros((4, 4)), length_std=0.1, unit=unit, unit_std=0.1)
     pose = Pose("a.jpg", 1, 0.0, tracked, poses=FollowedPoses(height))

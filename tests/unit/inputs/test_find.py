@@ -42,9 +42,8 @@ def test_samples_of_either_byte_order_are_taken(order: str) -> None:
     samples = np.arange(48, dtype=f"{order}u2").reshape(4, 6, 2)
     (frame,) = as_inputs(samples)
     assert isinstance(frame, Frame)
-    assert frame.image is not None
-    assert frame.image.pixels.dtype == np.uint16
-    np.testing.assert_array_equal(frame.image.pixels, samples[..., 0])
+    assert frame.decoded().pixels.dtype == np.uint16
+    np.testing.assert_array_equal(frame.decoded().pixels, samples[..., 0])
 
 
 def video(path: Path) -> Path:

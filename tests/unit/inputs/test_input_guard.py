@@ -6,6 +6,7 @@ import pickle
 from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from io import BytesIO, StringIO, TextIOWrapper
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from rdstitch.errors import ArgumentError, InputError, LimitError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs import source as sources
 from rdstitch.inputs.decoded_image_cache import DecodedImageCache
-from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.frame import DeferredImage, Frame
 from rdstitch.inputs.frame_stream import open_frame_stream
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
@@ -26,6 +27,7 @@ from rdstitch.io import Metadata, write_image
 from rdstitch.io import read as reading
 from rdstitch.io.mask import Mask
 from rdstitch.io.read import DecodedImage, read_image
+from rdstitch.system.cache import Cache
 from tests.videos import write_video
 
 
@@ -241,8 +243,7 @@ def test_every_nth_frame_of_a_video_with_its_number_and_time(video: Path) -> Non
     assert [frame.number for frame in frames] == [0, 2, 4]
     assert [frame.timestamp for frame in frames] == pytest.approx([0.0, 0.4, 0.8])
     assert [frame.path.name for frame in frames] == ["drive_000000.png", "drive_000002.png", "drive_000004.png"]
-    images = [frame.image for frame in frames]
-    assert [int(np.median(image.pixels)) for image in images if image] == pytest.approx([0, 80, 160], abs=3)
+    assert [int(np.median(frame.decoded().pixels)) for frame in frames] == pytest.approx([0, 80, 160], abs=3)
     assert arrivals.inputs == [str(video)]
 
 
@@ -275,3 +276,14 @@ def test_names_need_not_be_utf8(names: bytes | str) -> None:
     stream = StringIO(names) if isinstance(names, str) else TextIOWrapper(BytesIO(names), encoding="utf-8")
     arrivals = open_frame_stream("-", frames_folder=Path, names=stream)
     assert [os.fsencode(frame.path) for frame in arrivals] == [b"a.jpg", b"b\xff.jpg", b"c.jpg"]
+
+
+def test_planes_of_one_file_are_images_of_their_own(tmp_path: Path) -> None:
+    metadata = Metadata((3, 2))
+    planes = [DecodedImage(np.full((2, 3), level, np.uint8), None, metadata) for level in (1, 2)]
+    frames = [Frame(Path("stack.tif"), image=DeferredImage(metadata, partial(deepcopy, plane))) for plane in planes]
+    read, _ = read_sources(frames, skip_bad=False)
+    for _ in range(2):  # of the second time from where they are kept
+        assert [int(source.read(keep=True).pixels.max()) for source in read] == [1, 2]
+    for cache in (Cache.at(tmp_path), Cache.for_this_run(tmp_path)):
+        assert len({source.content(cache) for source in read}) == 2

@@ -24,7 +24,6 @@ from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.inputs.delays import DELAYS
 from rdstitch.inputs.keyframes import fitted_affine
 from rdstitch.inputs.odometry import BodyPose
-from rdstitch.results.messages import Message
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import Sequence, blank, sequence_over
 from rdstitch.tracking import (
@@ -35,12 +34,12 @@ from rdstitch.tracking import (
     TrackingResult,
 )
 from rdstitch.tracking.camera_check import check_given_camera
-from rdstitch.tracking.camera_knowledge import CameraKnowledge
+from rdstitch.tracking.camera_knowledge import CameraKnowledge, FocalLength, FocalOrigin
 from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.map_refinement import MapRefinement
 from rdstitch.tracking.metric_plane import MetricPlane
 from rdstitch.tracking.odometry_prediction import OdometryPrediction
-from rdstitch.tracking.tracked_frame import Frame, TrackedFrame
+from rdstitch.tracking.tracked_frame import IncomingFrame, TrackedFrame
 
 SIZE = (320, 240)
 DISTORTION = -0.25
@@ -275,7 +274,7 @@ def test_where_no_homography_fits_frames_are_lost_and_keyframes_stay(
     tracker, images = _tracker(), _frames(drive)
     for image in images[:12]:
         tracker.add(image, Camera(SIZE, focal=256.0))
-    assert tracker._knowledge.plane is not None
+    assert tracker._map.knowledge.plane is not None
     monkeypatch.setattr(
         "rdstitch.tracking.keyframe_map.fitted_homography",
         lambda *given: (None, np.zeros(len(given[2]), dtype=np.bool_)),
@@ -321,14 +320,14 @@ def _keyframe(number: int, placement: Placement | None = None) -> TrackedFrame:
     """Of a camera with a given focal length, on a body that moves ahead."""
     camera = Camera((640, 480), -0.2, focal=1.3 * 400.0, focal_source="option")
     image = prepare(View(np.zeros((480, 640), dtype=np.uint8)), None)
-    frame = Frame(number, camera, image, MADE_UP.__getitem__, body=BodyPose(0.5 * number, 0.0, 0.0))
+    frame = IncomingFrame(number, camera, image, MADE_UP.__getitem__, body=BodyPose(0.5 * number, 0.0, 0.0))
     return TrackedFrame(frame, placement or _placed(number, 0.0, 0.0, 1.0), True, np.zeros((4, 4)), keyframe=True)
 
 
 def _given_camera() -> CameraKnowledge:
     knowledge = CameraKnowledge.of(AlignmentOptions(lens_known=True), EstimationOptions(distortion=-0.2))
-    knowledge.focal, knowledge.plane = 1.3, MetricPlane(1.3, (0.1, -0.2), True)
-    return knowledge
+    focal = FocalLength(1.3, 0.01, FocalOrigin.GIVEN, 0.01)
+    return replace(knowledge, focal=focal, plane=MetricPlane(1.3, (0.1, -0.2), True))
 
 
 def test_keyframes_by_odometry_are_no_measurement_of_it() -> None:
@@ -346,11 +345,8 @@ def test_keyframes_by_odometry_are_no_measurement_of_it() -> None:
 
 
 def test_keyframes_without_links_show_nothing_of_the_camera() -> None:
-    knowledge, messages = _given_camera(), list[Message]()
-    before = replace(knowledge)
-    keyframe_map = KeyframeMap(knowledge, [_keyframe(23), _keyframe(24)], has_plane=True, added=24)
-    assert not check_given_camera(keyframe_map, keyframe_map.keyframes[-1].frame, messages.append)
-    assert (knowledge, messages) == (before, [])
+    keyframe_map = KeyframeMap(_given_camera(), [_keyframe(23), _keyframe(24)], has_plane=True, added=24)
+    assert check_given_camera(keyframe_map, keyframe_map.keyframes[-1].frame) is None
 
 
 def test_an_alignment_that_is_dropped_keeps_no_worker_busy() -> None:
