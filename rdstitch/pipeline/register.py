@@ -1,9 +1,10 @@
 """The registration that pano, mosaic, calibrate and trajectory share: features, pairs, one alignment."""
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
@@ -49,7 +50,9 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
         sources = with_image_circle(sources, executor, cache, run.guard, options.features.limits[1])
     aligner = Aligner.of(sources, options, cache, purpose)
     store = cache if options.cache is not None else Cache.for_this_run()
-    detected = detect_by_contrast(sources, options.features, run, executor, store)
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(import_module, "scipy.sparse.csgraph")  # 0.15 s, which alignments would wait for
+        detected = detect_by_contrast(sources, options.features, run, executor, store)
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
     candidates = first_pairs(features, options.seed, positions_of(sources))
