@@ -213,9 +213,9 @@ def read_limited(path: str | Path, most: int, *, regular: bool = True) -> bytes:
 
 
 def read_beginning(path: str | Path, most: int, *, regular: bool = True) -> bytes:
-    """As much of a file, but no more, however large it is."""
+    """The first ``most`` bytes of a file or URL, or all where it has fewer; unless ``regular``, also of a pipe."""
     blocks = []
-    with open_regular(path) if regular else Path(path).open("rb") as stream:
+    with open_regular(path) if regular or is_url(path) else Path(path).open("rb") as stream:
         # What a stream is asked for is allocated, however small the file.
         while most > 0 and (block := stream.read(min(most, _READ_AT_ONCE))):
             most -= len(block)

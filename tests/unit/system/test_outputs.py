@@ -347,6 +347,13 @@ def test_names_of_this_machine_are_no_urls(name: str) -> None:
     assert not is_url(name)
 
 
+def test_a_list_of_images_is_read_from_any_place(flight: str) -> None:
+    fsspec.filesystem("memory").pipe("/flight/list.txt", f"{flight}/f9.jpg\n{flight}/f2.tif\n".encode())
+    assert [str(frame.path) for frame in find_images([f"@{flight}/list.txt"]).frames] == [
+        str(Path(f"{flight}/{name}")) for name in ("f9.jpg", "f2.tif")
+    ]
+
+
 def test_folder_and_pattern(flight: str) -> None:
     for named in (flight, f"{flight}/*"):
         assert [frame.path.name for frame in find_images([named]).frames] == ["f2.tif", "f9.jpg", "f10.png"]
