@@ -16,6 +16,7 @@ from rdstitch.inputs.frame import Frame, Images
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import ImageSpec, write_strips
+from rdstitch.io.fingerprint import fingerprint
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.strips import Strip
 from rdstitch.io.tiff import written_strips
@@ -31,7 +32,7 @@ from rdstitch.sidecar.read import read_sidecar
 from rdstitch.sidecar.recomposition import Recomposition
 from rdstitch.sidecar.write import sidecar
 from rdstitch.system.native_threads import one_native_thread
-from rdstitch.system.outputs import Outputs, fingerprint, json_bytes
+from rdstitch.system.outputs import Outputs, json_bytes
 from rdstitch.system.progress import Progress, silent
 
 

@@ -39,7 +39,8 @@ from rdstitch.stage.estimate_flat_field import agrees_with_overlaps
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.pair_candidates import SearchPlan
 from rdstitch.stage.positions import Scan, grid_from_arrays, grid_from_names, grid_from_table, grid_from_tiles
-from rdstitch.stage.register_tiles import TileRegistration, register_tiles
+from rdstitch.stage.register_tiles import LensEstimate, TileRegistration, register_tiles
+from rdstitch.stage.sentences import axes_contradicted
 from rdstitch.stage.tile_inputs import as_tiles, tile_frames
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, text_bytes
@@ -217,10 +218,12 @@ def _placed(
     plan = SearchPlan.of(nominal, options.search)
     factor = plan.factor
     grid, shown = with_measured_axes(nominal, lambda index: coarse_tile(read(index), factor), factor, plan.search)
-    messages = [Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown")] if shown else []
+    messages = [axes_contradicted(nominal.source, shown)] if shown else []
     if grid.pixel_size is not None:
         sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
-    tiled = register_tiles(replace(plan, grid=grid), read, distortion=options.distortion, progress=progress)
+    known = LensEstimate.FREE if options.distortion == "auto" else options.distortion
+    lens = LensEstimate.IF_SHOWN if known is None else known
+    tiled = register_tiles(replace(plan, grid=grid), read, distortion=lens, progress=progress)
     for index in set(range(len(grid))) - set(tiled.compared.ravel().tolist()):
         read(index)
     if options.flat_field == "auto" and sources[0].flat_field is not None and not _overlaps_show(sources, tiled):

@@ -13,11 +13,11 @@ from rdstitch.arrays import FloatArray
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.georeferencing.georeference import Georeference
+from rdstitch.io.fingerprint import Fingerprint, fingerprint
 from rdstitch.sidecar.image_record import ImageRecord
 from rdstitch.sidecar.records import VERSION, SidecarRecord
 from rdstitch.system.file_access import read_text
 from rdstitch.system.output_checks import tiles_folder
-from rdstitch.system.outputs import Fingerprint, fingerprint
 from rdstitch.system.records import Matrix, convert, parse_json
 
 _OF_A_MACHINE = ("max_memory", "workers")  # options that the machine that wrote a sidecar had, not the picture

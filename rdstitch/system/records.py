@@ -29,7 +29,10 @@ Matrix = Annotated[tuple[Triple, Triple, Triple], Meta(description="3 x 3, row b
 
 
 def parse_json(text: str, file: str) -> Any:
-    """JSON text as plain values; ``file`` is what messages call it."""
+    """JSON text as plain values; ``file`` is what messages call it.
+
+    Numbers that are not finite, NUL characters and deep nesting are refused, wherever they are.
+    """
     try:
         value = json.loads(text)
     except json.JSONDecodeError as error:

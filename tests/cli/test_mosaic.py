@@ -22,8 +22,9 @@ from rdstitch.pipeline.recipes import stitch_found
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.synthetic import Sequence
-from rdstitch.verification.findings import Finding, Kind
+from rdstitch.verification.findings import Kind
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, flight, sidecar_of, start, transfers
+from tests.registrations import finding
 from tests.sampled import sampled
 
 
@@ -167,7 +168,7 @@ OUTPUTS = {"pano": "out.png", "mosaic": "out.png", "calibrate": "camera.json", "
 
 
 def _pretend(monkeypatch: pytest.MonkeyPatch, *found: Message) -> None:
-    findings = tuple(Finding(Kind.ERRORS, severity=message.severity) for message in found)
+    findings = tuple(finding(Kind.ERRORS, severity=message.severity) for message in found)
     monkeypatch.setattr(accept, "judge", lambda *arguments, **options: findings)
     monkeypatch.setattr(accept, "messages_of", lambda *arguments: list(found))
 
