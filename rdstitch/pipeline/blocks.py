@@ -92,7 +92,7 @@ def mosaic_blocks(
             found = replace(found, frames=frames)
             # These are of the first block, or of its reference image.
             run, further = replace(run, options=_for_further_blocks(run.options), beside=NOTHING_BESIDE), []
-    return (_without_blocks(results[0], results[1:], [*listed.messages, *refused]), *map(_without_blocks, results[1:]))
+    return _naming_left_out_once(results, [*listed.messages, *refused])
 
 
 def _for_further_blocks(options: StitchOptions) -> StitchOptions:
@@ -102,19 +102,16 @@ def _for_further_blocks(options: StitchOptions) -> StitchOptions:
     return replace(options, save_camera=None, reference=None, composite=composite, exclude=(), include_only=())
 
 
-def _without_blocks(
-    result: StitchResult, others: Sequence[StitchResult] | None = None, more: Sequence[Message] = ()
-) -> StitchResult:
-    """A block that does not name as left out what is in others; without others, nothing: the first one names it."""
-    elsewhere = {
-        str(source.path)
-        for registration in (other.registration for other in others or ())
-        for source, used in zip(registration.sources, registration.alignment.used, strict=True)
-        if used
-    }
-    kept = [
-        message
-        for message in result.registration.messages
-        if message.severity != "left out" or (others is not None and not elsewhere.issuperset(message.images))
-    ]
-    return replace(result, registration=replace(result.registration, messages=(*kept, *more)))
+def _naming_left_out_once(results: Sequence[StitchResult], messages: Sequence[Message]) -> tuple[StitchResult, ...]:
+    """Blocks of which the first names the images that are in none, and has messages on all."""
+    placed = {str(source.path) for result in results for source in result.placed.sources}
+    named = []
+    for block, result in enumerate(results):
+        kept = [
+            message
+            for message in result.messages
+            if message.severity != "left out" or (block == 0 and not placed.issuperset(message.images))
+        ]
+        more = messages if block == 0 else ()
+        named.append(replace(result, registration=replace(result.registration, messages=(*kept, *more))))
+    return tuple(named)

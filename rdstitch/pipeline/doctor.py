@@ -41,44 +41,31 @@ _GRID = 24  # points a side by which an overlap is measured
 
 @dataclass(frozen=True)
 class Examination:
-    """What to expect of a run.
-
-    Attributes
-    ----------
-    images : int
-        That can be read.
-    unreadable : tuple of str
-        Every other one, with the reason.
-    sizes : tuple of (str, int)
-        "width x height" and how many images have it, commonest first.
-    cameras : tuple of (str, int)
-        Make, model and serial number by EXIF, and how many images; "unknown" where it says nothing.
-    focal : str
-        What is known of the focal length.
-    blurred, dark, burnt : tuple of str
-        Names of images that are much less sharp than the others, that are dark, and that are burnt out.
-    alone : tuple of str
-        Names of images that found no place among the others.
-    overlap : float or None
-        Median share of an image that its best partner shows too; None where nothing fits together.
-    plan : CompositePlan or None
-        Size of the mosaic, with memory and time of compositing it; None where there would be none.
-    advice : tuple of str
-        What to change, most important first; empty where nothing is amiss.
-    """
+    """What to expect of a run."""
 
     images: int
+    """That can be read."""
     unreadable: tuple[str, ...]
+    """Every other one, with the reason."""
     sizes: tuple[tuple[str, int], ...]
+    """Width x height and how many images have it, commonest first."""
     cameras: tuple[tuple[str, int], ...]
+    """Make, model and serial number by EXIF, and how many images; "unknown" where it says nothing."""
     focal: str
+    """What is known of the focal length."""
     blurred: tuple[str, ...]
+    """Names of images that are much less sharp than the others."""
     dark: tuple[str, ...]
     burnt: tuple[str, ...]
+    """Names of images that are burnt out."""
     alone: tuple[str, ...]
+    """Names of images that found no place among the others."""
     overlap: float | None
+    """Median share of an image that its best partner shows too; None where nothing fits together."""
     plan: CompositePlan | None
+    """Size of the mosaic, with memory and time of compositing it; None where there would be none."""
     advice: tuple[str, ...]
+    """What to change, most important first; empty where nothing is amiss."""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
