@@ -60,11 +60,11 @@ class FeatureOptions(Options):
 
     def for_images(self, count: int) -> Self:
         """The same with numbers for what was left open: fewer than eight images share what eight would have."""
-        share = max(_BUDGET / max(count, 1), 1.0)
+        factor = max(_BUDGET / max(count, 1), 1.0)
         return replace(
             self,
-            max_features=self.max_features or round(MAX_FEATURES * min(share, _MAX_FEATURES)),
-            work_megapixels=WORK_MEGAPIXELS * min(share, _MAX_PIXELS)
+            max_features=self.max_features or round(MAX_FEATURES * min(factor, _MAX_FEATURES)),
+            work_megapixels=WORK_MEGAPIXELS * min(factor, _MAX_PIXELS)
             if self.work_megapixels == "auto"
             else self.work_megapixels,
         )

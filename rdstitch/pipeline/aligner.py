@@ -181,8 +181,8 @@ class Aligner:
             twice = {*distinct.copies, *distinct.near_copies}
             return alignment.with_messages([self._counted_once(twice)] if twice else [])
 
-        found, known = self._recalled("draft", task, lambda: (task.draft, task.found))
-        draft = complete(found)
+        drafted, known = self._recalled("draft", task, lambda: (task.draft, task.found))
+        draft = complete(drafted)
         if misfits := self._misfits(draft, distinct):
             with_them = self._drafted(pairs, counted=counted | misfits)
             if with_them.alignment.model != draft.model:  # so little new ground tells of motion, but not of the lens
@@ -268,9 +268,9 @@ class Aligner:
         for pair in pairs:
             if pair.relation and pair.images not in known:
                 errors = pair.errors(alignment.transfer)[pair.relation.inliers]
-                good = errors[errors < max(self.threshold, SAME_PX)]
-                rms = float(np.sqrt(np.mean(good**2))) if len(good) else math.nan
-                yield LinkFit(*pair.images, len(errors), len(good), rms, Unused.COPY)
+                agreeing = errors[errors < max(self.threshold, SAME_PX)]
+                rms = float(np.sqrt(np.mean(agreeing**2))) if len(agreeing) else math.nan
+                yield LinkFit(*pair.images, len(errors), len(agreeing), rms, Unused.COPY)
 
     def _counted_once(self, twice: Iterable[int]) -> Message:
         names = shortened(names_of(self.paths[k] for k in sorted(twice)))

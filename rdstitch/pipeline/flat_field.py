@@ -37,13 +37,15 @@ def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list
         channels = 1 if pixels.ndim == 2 else pixels.shape[2]
         field = read_flat_field(wanted, sources[0].camera.image_size, channels)
         return [replace(source, flat_field=field) for source in sources], []
-    shown = estimate_illumination(lambda index: sources[index].read().pixels, len(sources))
-    if shown.field is None and len(sources) < MIN_TILES:
+    estimate = estimate_illumination(lambda index: sources[index].read().pixels, len(sources))
+    if estimate.field is None and len(sources) < MIN_TILES:
         text = f"{len(sources)} tiles are too few to show their flat field, and samples stay as they are"
         return list(sources), [Message(text, severity="note", code="flat-field")]
-    if shown.field is None:
+    if estimate.field is None:
         return list(sources), [NO_FLAT_FIELD]
-    levels = zip(shown.dark, shown.dark_error, strict=True)
+    levels = zip(estimate.dark, estimate.dark_error, strict=True)
     dark = ", ".join(f"{level:.0f} ± {error:.0f}" if error > 0.0 else "not shown" for level, error in levels)
-    text = f"flat field: {shown.shading:.0%} less light where it is darkest, ± {shown.error:.1%}; dark level {dark}"
-    return [replace(source, flat_field=shown.field) for source in sources], [Message(text, severity="note")]
+    text = (
+        f"flat field: {estimate.shading:.0%} less light where it is darkest, ± {estimate.error:.1%}; dark level {dark}"
+    )
+    return [replace(source, flat_field=estimate.field) for source in sources], [Message(text, severity="note")]

@@ -84,8 +84,8 @@ def align_registration_locally(
     pairs = [pair for pair in registration.used_pairs if pair.relation]
 
     def match(pair: PairRegistration) -> Match:
-        found = pair.correspondences
-        return Match(int(position[pair.image1]), int(position[pair.image2]), found.points1, found.points2)
+        matched = pair.correspondences
+        return Match(int(position[pair.image1]), int(position[pair.image2]), matched.points1, matched.points2)
 
     def edges_of(images: list[int]) -> list[FloatArray]:
         with ThreadPoolExecutor(threads) as pool:
@@ -124,8 +124,8 @@ def is_stretched(plan: CanvasPlan) -> bool:
         # A fisheye's border is stretched on any plane.
         flat = replace(image.camera, distortion=0.0, distortion2=0.0, distortion3=0.0, image_circle=None)
         middle, right, down = (canvas.place(flat, image.homography, at + d) for d in ((0, 0), (step, 0), (0, step)))
-        shown = np.isfinite(middle + right + down).all(axis=1)
-        jacobian = np.stack([right - middle, down - middle], axis=-1)[shown] / step
+        visible = np.isfinite(middle + right + down).all(axis=1)
+        jacobian = np.stack([right - middle, down - middle], axis=-1)[visible] / step
         magnification.append(np.linalg.svd(jacobian, compute_uv=False))
     every = np.concatenate(magnification)
     largest = float(every[:, 0].max() / np.median(every[:, 0]))
