@@ -63,8 +63,7 @@ def follow(
     unread: dict[Path, int] = {}  # numbers of frames that come again
     of_preview: list[Message] = []  # told with the next frame
     for arrived in frames:
-        number = unread.pop(arrived.path, -1)
-        number = next(numbers) if number < 0 else number
+        number = unread.pop(arrived.path) if arrived.path in unread else next(numbers)
         if not is_selected(arrived, options.exclude, options.include_only):
             continue
         frame = arrived if arrived.number is not None else replace(arrived, number=number)

@@ -61,8 +61,8 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
     moving = without_static_background(estimator, pairs, candidates)
     estimator, pairs = moving or (estimator, pairs)
     pairs = match_repeated_patterns(estimator, pairs) if purpose.lens_only else pairs
-    given = options.threshold, options.known_distortion
-    mixed, other_lens = separate_lenses(aligner.cameras, pairs, *given, executor)
+    threshold, distortion = options.threshold, options.known_distortion
+    mixed, other_lens = separate_lenses(aligner.cameras, pairs, threshold, distortion, executor)
     progress("aligning", 0, 1)
     pairs = [pair for pair in pairs if not {*pair.images} & other_lens.keys()]
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
@@ -75,17 +75,19 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
     settle = match_crossings if purpose.lens_only else settle_repeated_pattern
     aligned, undecided = settle(aligner, estimator, aligned, sources, detected.stretch, options.threads)
     unplaced = {**other_lens, **detected.damaged, **undecided}
+    alignment, keypoints = aligned.alignment, tuple(features.counts.tolist())
+    messages = [
+        *alignment.messages,
+        *([_STATIC_BACKGROUND] if moving else []),
+        *_low_contrast(detected.equalized, alignment, aligner.paths),
+        *explain_unaligned(alignment, aligner.paths, keypoints, unplaced),
+    ]
     return Registration(
         tuple(sources),
-        counts := tuple(features.counts.tolist()),
+        keypoints,
         tuple(aligner.used(aligned)),
-        aligned.alignment,
-        (
-            *aligned.alignment.messages,
-            *([_STATIC_BACKGROUND] if moving else []),
-            *_low_contrast(detected.equalized, aligned.alignment, aligner.paths),
-            *explain_unaligned(aligned.alignment, aligner.paths, counts, unplaced),
-        ),
+        alignment,
+        tuple(messages),
         static_background=moving is not None,
         stretch=detected.stretch,
         mixed=mixed,
