@@ -9,8 +9,6 @@ from rdstitch.errors import ArgumentError
 from rdstitch.options.option import Options, documented, option, options_of, writes
 from rdstitch.options.shared_options import Height
 
-_REPORT_SUFFIXES = (".html", ".htm")
-
 
 @documented
 @dataclass(frozen=True)
@@ -19,13 +17,6 @@ class ReportFile(Options):
 
     report: Path | None = writes("Write a report to FILE (.html): graph, votes on λ, matches, residuals.")
     command: str = ""  # the command line, for the report
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.report is not None:
-            from rdstitch.system.output_checks import check_suffix
-
-            check_suffix(self.report, _REPORT_SUFFIXES)
 
 
 @documented
