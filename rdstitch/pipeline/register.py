@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import partial
 
 from rdstitch.alignment import Alignment
-from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.sentences import explain_unaligned
 from rdstitch.features import LightGlue, match
 from rdstitch.inputs.positions import positions_of
@@ -92,21 +91,6 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
         stretch=detected.stretch,
         mixed=mixed,
     )
-
-
-def with_frontal_reference(registration: Registration, options: StitchOptions, *, always: bool) -> Registration:
-    """The same registration with an undistorted image as its plane; directions of a turn on the spot stay.
-
-    That is the reference image, unless it was chosen here and another one crosses its horizon. With ``always`` a
-    rectified plane, that of one camera's poses, gives way too.
-    """
-    alignment = registration.alignment
-    if alignment.on_sphere or (not always and alignment.poses is not None):
-        return registration
-    reference = alignment.reference if options.reference is not None else frontal_reference(alignment)
-    if not always and reference == alignment.reference:
-        return registration
-    return replace(registration, alignment=in_frame_of(alignment, reference))
 
 
 def _matching(options: StitchOptions) -> FeatureMatching:
