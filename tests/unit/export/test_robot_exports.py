@@ -79,6 +79,15 @@ def test_images_of_two_cameras_are_not_given_one(other: Camera) -> None:
     assert [line.split()[-2:] for line in same.splitlines()[1::2]] == [["1", "a.jpg"], ["1", "b.jpg"]]
 
 
+def test_an_image_that_is_left_out_needs_no_camera_of_colmap() -> None:
+    sources = [source("a.jpg"), source("b.jpg"), source("left out.jpg", orientation=6)]
+    poses, used = registration(sources).alignment.poses, np.array([True, True, False])
+    poses = replace(poses, yaw=np.where(used, poses.yaw, np.nan))
+    cameras = (CAMERA, CAMERA, CAMERA.turned(6))
+    text = poses_file(stitched(registration(sources, cameras=cameras, used=used, poses=poses)), "images.txt")
+    assert [line.split()[-1] for line in text.splitlines()[1::2]] == ["a.jpg", "b.jpg"]
+
+
 @pytest.mark.parametrize("file", ["images.txt", "geo.txt"])
 def test_names_that_other_programs_would_cut_are_refused(file: str) -> None:
     with pytest.raises(ArgumentError, match=rf"{file}: names end at blanks there; rename a b\.jpg"):
