@@ -166,7 +166,11 @@ def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: Co
     matrix, size = saved.plane_to_output, saved.record.output.size
     same_sizes = all(saved.images[index].size == source.camera.image_size for index, source in used.items())
     alike = same_sizes and not asked and not saved.turned and options.same_turn(saved.composite)
-    return SavedGrid(matrix, size, saved.output_place) if alike and matrix is not None and size is not None else None
+    return (
+        SavedGrid(matrix, size, saved.record.output.place)
+        if alike and matrix is not None and size is not None
+        else None
+    )
 
 
 def _lens_of_band(
