@@ -162,7 +162,8 @@ def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: Co
     matrix, size = saved.plane_to_output, saved.record.output.size
     same_sizes = all(saved.images[index].size == source.camera.image_size for index, source in used.items())
     alike = same_sizes and not saved.turned and options.same_canvas(saved.composite)
-    return SavedGrid(matrix, size, saved.output_place) if alike and matrix is not None and size is not None else None
+    place = saved.record.output.place
+    return SavedGrid(matrix, size, place) if alike and matrix is not None and size is not None else None
 
 
 def _lens_of_band(

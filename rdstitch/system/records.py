@@ -89,7 +89,9 @@ def convert(value: Any, kind: Callable[..., Kind], file: str, field: str = "", *
         if missing := re.fullmatch(r"Object missing required field `(.*)`", problem):
             path, problem = f"{path.rstrip('`')}.{missing[1]}", "is missing"
         place = (field + path.rstrip("`")).lstrip(".")
-        raise InputError(": ".join(filter(None, (file, place, problem[:1].lower() + problem[1:])))) from error
+        if not problem[1:2].isupper():  # as of EPSG
+            problem = problem[:1].lower() + problem[1:]
+        raise InputError(": ".join(filter(None, (file, place, problem)))) from error
     except (UnicodeError, OverflowError) as error:
         raise InputError(f"{file}: cannot be read: {error}") from error
 
