@@ -181,7 +181,7 @@ class Structure:
     @classmethod
     def of(cls, observations: Observations, free: BoolArray) -> Self:
         """By the images of the links."""
-        image1, image2, moving = observations.image1, observations.image2, free.any(axis=1)
+        image1, image2, moving = observations.image1, observations.image2, np.asarray(free.any(axis=1))
         joined = moving[image1] & moving[image2]
         starts = range(0, len(observations), _LINKS_AT_ONCE)
         parts = [slice(first, min(first + _LINKS_AT_ONCE, len(observations))) for first in starts]
