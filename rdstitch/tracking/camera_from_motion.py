@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rdstitch.alignment.delays import at_delay, smooth
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.planar_motion import rotation_from_tilt
-from rdstitch.inputs.delays import DELAY_STD, at_delay, smooth
+from rdstitch.inputs.delays import DELAY_STD
 
 _POINTS = 32  # of a pair
 _OUTLIER = 3.0  # medians of the errors

@@ -9,13 +9,14 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions
+from rdstitch.alignment.delays import at_delay, change_with_delay
 from rdstitch.alignment.given_checks import judged_focal
 from rdstitch.alignment.motion_models import LOG_HEIGHT, MODELS, MotionModel
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import ModelName
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.delays import DELAY_STD, at_delay, change_with_delay
+from rdstitch.inputs.delays import DELAY_STD
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.robust import EstimationOptions
