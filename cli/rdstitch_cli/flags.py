@@ -8,18 +8,20 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin
+from typing import Annotated, Any, ForwardRef, get_args, get_origin
 
 import click
 from click.core import ParameterSource
 
-from rdstitch.options.option import Declared, Option, declaration, declared
+from rdstitch.options.option import Declared, FileUse, Option, Unit, declaration, declared
 from rdstitch_cli.config import CONFIG_FILE, config
 from rdstitch_cli.help_pages import EXIT_STATUSES, GroupedCommand
 from rdstitch_cli.terminal import Reporter
 
 Inputs = Annotated[tuple[Path, ...], "INPUT..."]  # an argument rather than an option
-ImageFile = Annotated[Path, Option("Image to write: .jpg, .png, .tif, .webp or .dzi.", flag="-o --output", writes=True)]
+ImageFile = Annotated[
+    Path, Option("Image to write: .jpg, .png, .tif, .webp or .dzi.", flag="-o --output", file=FileUse.WRITTEN)
+]
 PrintSidecar = Annotated[bool, Option("Print the sidecar as JSON.", flag="--json")]
 _GOES_ON = "the same command goes on from the cache"  # note at an interrupt
 
@@ -62,7 +64,7 @@ def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callab
 
 def flags_of(options: Any, *, only: str = "", without: str = "") -> list[click.Option]:
     """Flags of the options of a class, or of an object whose values are the defaults; all, or those of some names."""
-    chosen = [option for option in declared(options).values() if option.option.command_line]
+    chosen = [option for option in declared(options).values() if option.option.flag is not None]
     if only:
         chosen = [option for option in chosen if option.name in only.split()]
     return [_flag(o, getattr(options, o.name)) for o in chosen if o.name not in without.split()]
@@ -70,8 +72,8 @@ def flags_of(options: Any, *, only: str = "", without: str = "") -> list[click.O
 
 def values_of(kind: Any, given: Mapping[str, Any]) -> dict[str, Any]:
     """The options of a class among those that a command was given."""
-    options = ((name, option.option) for name, option in declared(kind).items())
-    return {name: given[name] for name, option in options if option.command_line and name in given}
+    flags = (name for name, each in declared(kind).items() if each.option.flag is not None)
+    return {name: given[name] for name in flags if name in given}
 
 
 def is_given(name: str) -> bool:
@@ -81,16 +83,14 @@ def is_given(name: str) -> bool:
 
 def _flag(entry: Declared, default: Any) -> click.Option:
     option = entry.option
-    if option.entered is not None and (entered := declaration(entry.name, Annotated[option.entered, option])):
-        entry = entered
     names = [*(option.flag or f"--{entry.name.replace('_', '-')}").split(), entry.name]
     how: dict[str, Any] = {"required": True} if default is inspect.Parameter.empty else {"default": default}
     plain = "" if _is_unset(default) else str(default)
-    kind = Path if Path in entry.types else entry.types[0] if entry.types else None
+    names_file = Path in entry.types or any(isinstance(kind, ForwardRef) for kind in entry.types)
+    kind = Path if names_file else entry.types[0] if entry.types else None
     how |= _KINDS.get(kind, _entered)(entry, default)
     shown = how.pop("shown", plain)
-    shown = option.default or shown
-    text = option.in_unit("degrees") + f"  [default: {shown}]" * bool(shown)
+    text = option.in_unit(Unit.DEGREES) + f"  [default: {shown}]" * bool(shown)
     return Flag(names, metavar=option.metavar or None, help=text, declared=option, **how)
 
 
@@ -101,7 +101,7 @@ def _is_unset(default: Any) -> bool:
 
 def _of_words(entry: Declared, default: Any) -> dict[str, Any]:
     """One of some words; of two that a switch stands for, by the switch."""
-    if "/" in entry.option.flag:
+    if "/" in (entry.option.flag or ""):
         off, on = entry.words
         chosen = {"callback": lambda _c, _o, value: on if value else off, "shown": ""}
         return {"is_flag": True, "default": default == on, **chosen}
@@ -117,7 +117,7 @@ def _entered(entry: Declared, default: Any) -> dict[str, Any]:
 
 _KINDS: dict[Any, Callable[[Declared, Any], dict[str, Any]]] = {
     None: _of_words,
-    bool: lambda _entry, _default: {"is_flag": True},
+    bool: lambda _entry, _default: {"is_flag": True, "shown": ""},
     str: lambda _entry, _default: {"type": str},
     Path: lambda entry, _default: {"type": FilePath(entry.words)},
     tuple[str, ...]: lambda _entry, _default: {"multiple": True, "type": str},
@@ -140,10 +140,10 @@ def _check_not_read(flags: Iterable[Flag], given: Mapping[str, Any]) -> None:
 
     named = [(flag.declared, given[str(flag.name)]) for flag in flags]
     paths = [(option, path) for option, path in named if isinstance(path, Path)]
-    read = [path for option, path in paths if option.reads]
+    read = [path for option, path in paths if option.file is FileUse.READ]
     if configuration := click.get_current_context().meta.get(CONFIG_FILE):
         read.append(configuration)
-    check_not_read([path for option, path in paths if option.writes], read)
+    check_not_read([path for option, path in paths if option.file is FileUse.WRITTEN], read)
 
 
 class FilePath(click.Path):
@@ -173,11 +173,8 @@ class EnteredValue(click.ParamType):  # type: ignore[type-arg]  # generic since 
 
     def __init__(self, entry: Declared) -> None:
         option = entry.option
-        if option.unit == "radians":
-            limits: dict[str, Any] = {
-                name: math.degrees(getattr(option, name)) for name in ("least", "above", "most", "below")
-            }
-            option = replace(option, unit="degrees", **limits)
+        if option.unit is Unit.RADIANS:
+            option = replace(option, unit=Unit.DEGREES, within=option.within.in_degrees)
         self.entry = replace(entry, option=option)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
@@ -190,9 +187,9 @@ class EnteredValue(click.ParamType):  # type: ignore[type-arg]  # generic since 
             with suppress(ValueError, OverflowError):
                 parsed = self._parsed(value, kind)
                 if self.entry.fits(parsed):
-                    return self._in_radians(parsed) if self.entry.option.unit == "degrees" else parsed
+                    return self._in_radians(parsed) if self.entry.option.unit is Unit.DEGREES else parsed
         expected = self.entry.expected
-        if self.entry.option.unit == "bytes":
+        if self.entry.option.unit is Unit.BYTES:
             expected = "an amount of memory such as 800M or 2G"
         elif self.entry.option.none:
             expected = f"{self.entry.option.none} or {expected}"
@@ -202,7 +199,7 @@ class EnteredValue(click.ParamType):  # type: ignore[type-arg]  # generic since 
         """A default, as one would enter it; empty where there is none."""
         if _is_unset(value):
             return self.entry.option.none if value is None else ""
-        if self.entry.option.unit == "degrees":
+        if self.entry.option.unit is Unit.DEGREES:
             value = math.degrees(value)
         return f"{value:g}" if isinstance(value, int | float) else str(value)
 
@@ -210,7 +207,7 @@ class EnteredValue(click.ParamType):  # type: ignore[type-arg]  # generic since 
         if get_origin(kind) is tuple:
             inner = get_args(kind)[0]
             return tuple(self._parsed(part, inner) for part in text.split(";" if get_origin(inner) is tuple else ","))
-        if self.entry.option.unit == "bytes":
+        if self.entry.option.unit is Unit.BYTES:
             parts = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([KMGT]?)(?:i?B)?\s*", text, re.IGNORECASE)
             return int(float(parts[1]) * 2 ** (10 * " KMGT".index(parts[2].upper() or " "))) if parts else 0
         prefix, colon, _ = self.entry.option.metavar.rpartition(":")  # EPSG:

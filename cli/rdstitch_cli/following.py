@@ -2,21 +2,20 @@
 
 import json
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import click
 
-from rdstitch.options.option import Option
+from rdstitch.options.option import Option, Range
 from rdstitch_cli.stitching import warn_of
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
     from rdstitch.inputs.frame import Named
-    from rdstitch.pipeline.run import Run
-    from rdstitch.pipeline.run_files import RunFiles
+    from rdstitch.pipeline.output_plan import OutputPlan
     from rdstitch.results.pose import FollowedPoses, Pose
     from rdstitch.results.registration import Registration
 
@@ -34,19 +33,16 @@ Idle = Annotated[
     Option(
         "With --follow: end after so long without a frame; otherwise a folder is followed until Ctrl-C.",
         "SECONDS",
-        above=0.0,
+        within=Range(above=0.0),
     ),
 ]
 
 
 @contextmanager
 def followed(
-    inputs: Sequence[Path],
-    run: "Run",
-    files: "RunFiles",
+    plan: "OutputPlan",
     reporter: Reporter,
     *,
-    every: int | None,
     idle: float | None,
     preview: Path | None = None,
     refresh: float = 0.0,
@@ -56,25 +52,26 @@ def followed(
     from rdstitch.inputs.frame_stream import open_frame_stream
     from rdstitch.pipeline.follow import follow
     from rdstitch.system.file_access import file_state
-    from rdstitch.system.outputs import Outputs
     from rdstitch.system.temporary_folder import TemporaryFolder
 
-    if len(inputs) != 1:
+    run = plan.run
+    if len(run.inputs) != 1:
         raise click.UsageError("--follow takes one input: a folder, a video, the index of a camera, a stream or -")
-    source, output = Path(inputs[0]), files.bag or files.written[0]
+    (given,) = map(str, run.inputs)  # as a path an address would lose one of its slashes
+    source, output = Path(given), plan.replaced_bag or next(iter((*plan.images, *plan.files)))
     if source.is_dir() and output.resolve().parent == source.resolve():
         raise click.UsageError(f"{output}: lies in the folder that is followed; choose a name in another folder")
-    with Outputs(run.options.overwrite) as outputs:
-        files.check(outputs)
+    with run.outputs:
+        plan.check()
     for note in run.notes:
         reporter.tell(note)
     before = None if preview is None else file_state(preview)
     with TemporaryFolder() as folder:
         arrivals = open_frame_stream(
-            str(inputs[0]),  # as a path an address would lose one of its slashes
+            given,
             frames_folder=lambda: folder,
             names=sys.stdin,
-            every=every or 1,
+            every=run.every or 1,
             idle=idle,
             topic=run.options.topic,
         )

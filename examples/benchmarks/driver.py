@@ -78,7 +78,7 @@ SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff"}
 def apart(benchmark: str, *arguments: str) -> dict[str, Any]:
     """What a benchmark that runs in a process of its own, so that memory is its own, prints last as JSON."""
     command = [sys.executable, "-m", f"examples.benchmarks.{benchmark}", *arguments]
-    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
     row: dict[str, Any] = json.loads(printed.splitlines()[-1])
     return row
 

@@ -181,7 +181,7 @@ def _places(kind: str, seeds: Several[int]) -> None:
         models.append(result.registration.alignment.model)
         off = flight.errors(result)
         errors += np.hypot(*off.T).tolist()
-        said.append((place.rms, place.std))
+        said.append((place.rms or math.nan, place.std))
         squares.append(float(np.mean(off**2)) / place.std**2)
     if errors:
         rms, std = np.median(said, axis=0)

@@ -190,7 +190,7 @@ class Problem(LinkProblem):
         tilt_spread = _TILT_SPREAD_START if tilt_spread is None else tilt_spread
         references = [self.reference] if self.camera_priors.fix_frame else []
         freedom = FreeParameters.fixing(model, self.count, references, self.free_lens)
-        log_focal = None if shared is None or not len(shared) else float(shared[-1])
+        log_focal = None if shared is None or not len(shared) else model.log_focal(shared)
         priors = self.camera_priors.priors(model, self.count, tilt_spread, log_focal)
         overdispersion = overdispersion or self.overdispersion
         return BundleAdjuster(model, self.observations, freedom, priors, overdispersion, min_gain=self.min_gain)

@@ -196,7 +196,7 @@ def _with_lens(adjusted: AdjustedImages, camera: Camera) -> Camera:
     converged = adjusted.fit.result.converged or not adjusted.problem.free_lens.any()
     shown = adjusted.lens.observable and converged
     std = _nearest_distortion_std(result, adjusted.considered_lens_covariance) if shown else math.inf
-    return replace(result, distortion_std=std)
+    return replace(result, distortion_std=std or None)
 
 
 def _nearest_distortion_std(camera: Camera, covariance: FloatArray) -> float:

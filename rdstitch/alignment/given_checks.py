@@ -121,7 +121,7 @@ def is_strained(priors: CameraPriors, fit: Fit) -> bool:
     """Whether a focal length that the user gave gave way to the images by more than is likely."""
     if priors.focal_source not in ("option", "file") or not fit.model.has_metric_poses:
         return False
-    moved = float(fit.result.parameters.shared[-1]) - priors.log_focal
+    moved = fit.model.log_focal(fit.result.parameters.shared) - priors.log_focal
     return abs(moved) > _STRAINED * priors.log_focal_std
 
 

@@ -52,7 +52,7 @@ def with_near_copies(
     poses = start.poses[where]
     tilted = camera_priors.attitudes - camera_priors.attitudes[number[firsts]]
     poses[copies] = _tilted(fit, where[copies], tilted[copies])
-    log_focal = float(start.shared[-1]) if model.one_camera else None
+    log_focal = model.log_focal(start.shared) if model.one_camera else None
     priors = camera_priors.priors(model, len(images), fit.tilt_spread or 0.0, log_focal)
     adjuster = BundleAdjuster(
         model,

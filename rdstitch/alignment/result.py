@@ -231,7 +231,7 @@ class Alignment:
     @property
     def lens_given(self) -> bool:
         """Whether λ was given, not estimated."""
-        return self.distortion_std == 0.0
+        return self.cameras[self.reference].distortion_std is None
 
     @property
     def lens_observable(self) -> bool:

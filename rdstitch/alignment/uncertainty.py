@@ -166,7 +166,7 @@ def considered_covariance(problem: Problem, fit: Fit, covariance: FloatArray, *,
     """
     count, deviation = len(problem.free_lens), 0.0
     if fit.model.has_metric_poses:
-        log_focal = float(fit.model.physical_parameters(fit.result.parameters.shared)[0][-1])
+        log_focal = fit.model.log_focal(fit.result.parameters.shared)
         deviation = log_focal - problem.camera_priors.log_focal
     if not over_relief and abs(deviation) > _UNLIKELY_FOCAL * problem.camera_priors.log_focal_std:
         adjuster = replace(problem, free_lens=np.ones_like(problem.free_lens)).adjuster_of(fit)

@@ -8,7 +8,7 @@ the camera, whose images are resampled by it.
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -98,38 +98,42 @@ class LensSamples:
         return LensFit(float(np.sqrt(np.mean(error**2))), float(error.max()))
 
 
-_MODELS: dict[str, tuple[tuple[int, ...], tuple[int | None, ...]]] = {
-    "two terms": ((3, 5), (0, 1, None, None)),
-    "polynomial": ((3, 5, 7), (0, 1, None, None, 2)),
-    "rational": ((), (0, 1, None, None, 2, 3, 4, 5)),
-    "fisheye": ((3, 5, 7, 9), (0, 1, 2, 3)),
-}
-"""Powers of the undistorted radius, or of a fisheye's angle, beside that itself; which of their coefficients each of
-OpenCV's is, None for the tangential ones."""
+class OpenCVModel(NamedTuple):
+    """A lens model of OpenCV."""
+
+    kind: LensKind
+    powers: tuple[int, ...]  # of the undistorted radius, or of a fisheye's angle, beside that itself; rational without
+    fitted: tuple[int | None, ...]  # which of their coefficients each of OpenCV's is, None for the tangential ones
 
 
-def nearest_model(camera: Camera, names: Mapping[str, str], close: float = CLOSE) -> tuple[LensModel, LensFit, str]:
-    """The lens as one of :data:`_MODELS`, and its name: the first that is so close, pixels, or else the nearest.
+TWO_TERMS = OpenCVModel("brown", (3, 5), (0, 1, None, None))
+POLYNOMIAL = OpenCVModel("brown", (3, 5, 7), (0, 1, None, None, 2))
+RATIONAL = OpenCVModel("brown", (), (0, 1, None, None, 2, 3, 4, 5))
+FISHEYE = OpenCVModel("fisheye", (3, 5, 7, 9), (0, 1, 2, 3))
 
-    ``names`` are those that a format has for the models that it knows. A lens of another program's calibration is given
-    as it is where a model has all its terms; else the radial terms are fitted, and its two focal lengths and its
-    tangential terms kept.
+
+def nearest_model(
+    camera: Camera, names: Mapping[OpenCVModel, str], close: float = CLOSE
+) -> tuple[LensModel, LensFit, str]:
+    """The lens as one of the models that have a name, and that: the first so close, pixels, or else the nearest.
+
+    A lens of another program's calibration is given as it is where a model has all its terms; else the radial terms are
+    fitted, and its two focal lengths and its tangential terms kept.
     """
     lens, fits = camera.lens_model, []
-    kinds: dict[str, LensKind] = {model: kind_of(model == "fisheye") for model in names}
     if lens is not None and math.isclose(lens.mean_focal, camera.focal or 0.0):
-        for model, kind in kinds.items():
-            count = len(_MODELS[model][1])
-            if kind == lens.kind and not any(lens.coefficients[count:]):
+        for model, name in names.items():
+            count = len(model.fitted)
+            if model.kind == lens.kind and not any(lens.coefficients[count:]):
                 padded = (*lens.coefficients, *[0.0] * count)[:count]
-                return replace(lens, coefficients=padded), LensFit(0.0, 0.0), names[model]
-    for model, kind in kinds.items():
-        (powers, places), base = _MODELS[model], _without_radial_terms(camera, kind)
+                return replace(lens, coefficients=padded), LensFit(0.0, 0.0), name
+    for model, name in names.items():
+        base = _without_radial_terms(camera, model.kind)
         samples = LensSamples.of(camera, base)
-        start = np.arctan(samples.undistorted) if kind == "fisheye" else samples.undistorted
-        numbers = samples.fit(start, powers) if powers else samples.fit_rational()
-        k = tuple(base.coefficients[i] if at is None else float(numbers[at]) for i, at in enumerate(places))
-        fits.append((fitted := replace(base, coefficients=k, kind=kind), samples.compare(fitted), names[model]))
+        start = np.arctan(samples.undistorted) if model is FISHEYE else samples.undistorted
+        numbers = samples.fit(start, model.powers) if model.powers else samples.fit_rational()
+        k = tuple(base.coefficients[i] if at is None else float(numbers[at]) for i, at in enumerate(model.fitted))
+        fits.append((fitted := replace(base, coefficients=k, kind=model.kind), samples.compare(fitted), name))
         if fits[-1][1].largest <= close:
             break
     return min(fits, key=lambda one: one[1].largest)

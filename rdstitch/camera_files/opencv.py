@@ -10,7 +10,15 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from rdstitch.camera_files.lens_models import CameraFile, fitted_camera, kind_of, nearest_model
+from rdstitch.camera_files.lens_models import (
+    FISHEYE,
+    POLYNOMIAL,
+    RATIONAL,
+    CameraFile,
+    fitted_camera,
+    kind_of,
+    nearest_model,
+)
 from rdstitch.camera_files.own_record import OWN, Written, as_yaml, comments, own_record
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
@@ -151,7 +159,7 @@ def opencv_text(camera: Camera, *, yaml: bool = True, fisheye: bool = False) -> 
 
     Those have Brown's model, or the rational one where that is closer.
     """
-    lens, fit, _ = nearest_model(camera, {"fisheye": ""} if fisheye else {"polynomial": "", "rational": ""})
+    lens, fit, _ = nearest_model(camera, {FISHEYE: ""} if fisheye else {POLYNOMIAL: "", RATIONAL: ""})
     mark = {"fisheye_model": 1} if fisheye else {}
     content = {**_calibration(camera, lens, **mark), OWN: own_record(camera, fit)}
     return "%YAML:1.0\n---\n" + as_yaml(content) if yaml else json.dumps(content, indent=4) + "\n", fit
@@ -176,7 +184,7 @@ def _matrix(rows: int, *data: float) -> dict[str, Any]:
 
 def camera_info_yaml(camera: Camera) -> Written:
     """Write a camera as ``camera_info_manager`` reads it."""
-    names = {"polynomial": "plumb_bob", "rational": "rational_polynomial", "fisheye": "equidistant"}
+    names = {POLYNOMIAL: "plumb_bob", RATIONAL: "rational_polynomial", FISHEYE: "equidistant"}
     lens, fit, model = nearest_model(camera, names)
     content = _calibration(camera, lens, camera_name="camera", distortion_model=model)
     matrix = content["camera_matrix"]["data"]

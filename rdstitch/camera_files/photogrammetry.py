@@ -1,13 +1,23 @@
 """Files of COLMAP, OpenDroneMap and Kalibr: read as records, written as the nearest of their lens models."""
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from rdstitch.camera_files.lens_models import CameraFile, fitted_camera, kind_of, nearest_model
+from rdstitch.camera_files.lens_models import (
+    FISHEYE,
+    POLYNOMIAL,
+    RATIONAL,
+    TWO_TERMS,
+    CameraFile,
+    fitted_camera,
+    kind_of,
+    nearest_model,
+)
 from rdstitch.camera_files.own_record import OWN, Written, as_yaml, comments, own_record
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
@@ -24,8 +34,12 @@ _COLMAP = {
     "SIMPLE_RADIAL_FISHEYE": (1, 1),
     "RADIAL_FISHEYE": (1, 2),
     "OPENCV_FISHEYE": (2, 4),
+    "SIMPLE_FISHEYE": (1, 0),
+    "FISHEYE": (2, 0),
+    "SIMPLE_DIVISION": (1, 1),
+    "DIVISION": (2, 1),
 }
-"""COLMAP's models: how many focal lengths, and how many of OpenCV's coefficients, in its order."""
+"""COLMAP's models: how many focal lengths, and how many of OpenCV's coefficients, in its order, or λ."""
 
 _COLMAP_LINE = re.compile(r"\s*\d+\s+([A-Z_]+)\s+(\d+)\s+(\d+)\s+(\S.*)")
 
@@ -49,13 +63,27 @@ def read_colmap(camera: Sequence[str], file: str) -> CameraFile:
     size = convert((width, height), tuple[int, int], file, "SIZE", strict=False)
     # COLMAP's pixels have their centres at halves.
     focal, center = (values[0], values[focals - 1]), (values[focals] - 0.5, values[focals + 1] - 0.5)
+    if "DIVISION" in model:
+        return CameraFile(_division_camera(size, focal, center, values[-1]), "COLMAP")
     lens = LensModel(focal, center, tuple(values[focals + 2 :]), kind_of("FISHEYE" in model))
     return fitted_camera(lens, "COLMAP", size)
 
 
+def _division_camera(
+    size: tuple[int, int], focal: tuple[float, float], center: tuple[float, float], distortion: float
+) -> Camera:
+    """A camera of the division model, whose λ is that of focal lengths."""
+    if not math.isclose(*focal, rel_tol=1e-6):
+        raise ArgumentError(
+            f"PARAMS: a division model needs one focal length for x and y, not {focal[0]:g}, {focal[1]:g}"
+        )
+    camera = Camera(size, center=center, focal=focal[0], focal_source="file")
+    return camera.with_coefficients(distortion * (camera.scale / focal[0]) ** 2)
+
+
 def colmap_text(camera: Camera) -> Written:
     """Write a camera as COLMAP reads it: FULL_OPENCV, or OPENCV_FISHEYE where that is closer to the lens."""
-    names = {"rational": "FULL_OPENCV", "fisheye": "OPENCV_FISHEYE"}
+    names = {RATIONAL: "FULL_OPENCV", FISHEYE: "OPENCV_FISHEYE"}
     lens, fit, model = nearest_model(camera, names, close=0.0)
     # COLMAP's pixels have their centres at halves.
     numbers = (*camera.image_size, *lens.focal, *(value + 0.5 for value in lens.center), *lens.coefficients)
@@ -105,7 +133,7 @@ def read_opendronemap(entry: Any, file: str, name: str) -> CameraFile:
 
 def opendronemap_json(camera: Camera) -> Written:
     """Write a camera as OpenDroneMap takes it with ``--cameras``."""
-    lens, fit, kind = nearest_model(camera, {"polynomial": "brown", "fisheye": "fisheye_opencv"})
+    lens, fit, kind = nearest_model(camera, {POLYNOMIAL: "brown", FISHEYE: "fisheye_opencv"})
     (width, height), longer = camera.image_size, max(camera.image_size)
     fx, fy = (value / longer for value in lens.focal)
     entry = {
@@ -145,7 +173,7 @@ def read_kalibr(entry: Any, file: str, name: str) -> CameraFile:
 
 def camera_chain_yaml(camera: Camera) -> Written:
     """Write a camera as Kalibr does: "radtan", which has k1 and k2 only, or "equi" where that is closer."""
-    lens, fit, model = nearest_model(camera, {"two terms": "radtan", "fisheye": "equi"})
+    lens, fit, model = nearest_model(camera, {TWO_TERMS: "radtan", FISHEYE: "equi"})
     entry = {
         "camera_model": "pinhole",
         "intrinsics": [*lens.focal, *lens.center],

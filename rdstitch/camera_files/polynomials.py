@@ -45,7 +45,7 @@ class _Image(Struct, kw_only=True):
     f: int
     w: Side
     h: Side
-    v: Annotated[float, Meta(gt=0.0, lt=180.0, description="field of view, degrees")]
+    v: Annotated[float, Meta(gt=0.0, le=360.0, description="horizontal field of view, degrees")]
     a: float = 0.0
     b: float = 0.0
     c: float = 0.0
@@ -62,6 +62,8 @@ def read_hugin(text: str, file: str) -> CameraFile:
     if lens.f not in (_RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE):
         raise ArgumentError("f: only rectilinear lenses (f0) and fisheyes (f2, f3) are known here")
     size, fisheye = (lens.w, lens.h), lens.f != _RECTILINEAR
+    if not fisheye and lens.v >= 180.0:
+        raise ArgumentError(f"v: a rectilinear lens sees less than 180 degrees, not {lens.v:g}")
     center = (size[0] - 1) / 2 + lens.d, (size[1] - 1) / 2 + lens.e
     # Tangents of the half field of view for a rectilinear lens, angles for a fisheye.
     half_view = math.radians(lens.v) / 2

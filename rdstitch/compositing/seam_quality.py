@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.compositing.boxes import Box, Float32Array
 from rdstitch.compositing.seam_lines import SeamLines
-from rdstitch.system.late_imports import csgraph, sparse, spatial
+from rdstitch.system.late_imports import csgraph
 
 DIAGONAL = 1000.0  # pixels of an image's diagonal at which seams are looked at: about what a screen shows of it
 _HALF, _STEP = 12, 8  # half a window, and how far windows are apart
@@ -335,15 +335,13 @@ def _edges(window: Float32Array) -> tuple[float, float]:
 
 def _runs(images: IntArray, places: FloatArray, chosen: BoolArray) -> list[IntArray]:
     """Indices of the places of one border that were chosen and follow each other."""
-    indices = np.flatnonzero(chosen)
-    if not len(indices):
-        return []
-    at, pairs = places[indices], images[indices]
-    near = spatial.cKDTree(at).query_pairs(_NEXT, output_type="ndarray")
-    one, two = near[(pairs[near] == pairs[near[:, :1]]).all(axis=(1, 2))].T
-    graph = sparse.coo_array((np.ones(len(one)), (one, two)), shape=(len(at),) * 2)
-    _, group = csgraph.connected_components(graph, directed=False)
-    return np.split(indices[np.argsort(group, kind="stable")], np.cumsum(np.bincount(group))[:-1])
+    indices, runs = np.flatnonzero(chosen), list[IntArray]()
+    for border in np.unique(images[indices], axis=0):
+        of_border = indices[(images[indices] == border).all(axis=1)]
+        near = np.hypot(*(places[of_border, None] - places[of_border]).T) <= _NEXT
+        group = csgraph.connected_components(near, directed=False)[1]
+        runs += np.split(of_border[np.argsort(group, kind="stable")], np.cumsum(np.bincount(group))[:-1])
+    return runs
 
 
 def _stretch(images: IntArray, places: FloatArray, shift: FloatArray, run: IntArray, unit: float) -> SeamBreak:

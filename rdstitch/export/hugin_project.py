@@ -13,7 +13,6 @@ from rdstitch.camera_files.polynomials import HEAD, hugin_lens, image_line
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.geometry.planar_motion import nearest_rotation, rotation_from_tilt
 from rdstitch.results.registration import Registration
 
@@ -43,7 +42,7 @@ def project_of_hugin(registration: Registration, canvas: Canvas) -> str:
     seen = np.tensordot(matrix * np.sign(np.linalg.det(matrix)), _seen_on(canvas), axes=1)
     used = np.flatnonzero(alignment.used).tolist()
     lines, variables = _image_lines(alignment, used, [source.path.absolute() for source in sources])
-    control = _control_lines(registration, alignment, used, quarters)
+    control = _control_lines(registration, used, quarters)
     parts = [f"{HEAD}{_panorama(alignment, used, seen)}", "m i0", *lines, *variables, "v", *control]
     return "\n".join(parts) + "\n"
 
@@ -68,24 +67,18 @@ def _image_lines(alignment: Alignment, used: list[int], files: Sequence[Path]) -
     return lines, variables
 
 
-def _control_lines(
-    registration: Registration, alignment: Alignment, used: list[int], quarters: QuarterTurns
-) -> list[str]:
+def _control_lines(registration: Registration, used: list[int], quarters: QuarterTurns) -> list[str]:
     """Control points of all pairs that hold the images, as pixels of the files."""
-    holding = {fit.images for fit in alignment.holding}
+    holding = {fit.images for fit in registration.alignment.holding}
     number = {k: place for place, k in enumerate(used)}
     lines = []
     for pair in registration.pairs:
         if pair.images not in holding or not set(pair.images) <= number.keys():
             continue
-        (i, j), link = pair.images, pair.link().thinned(_CONTROL_POINTS)
-        first, second = (
-            _in_file(points, registration.alignment.cameras[k], alignment.cameras[k], quarters.orientations[k]).tolist()
-            for k, points in ((i, link.points1), (j, link.points2))
-        )
+        link = quarters.back.link(pair.link().thinned(_CONTROL_POINTS), registration.alignment.cameras)
         lines += [
-            f"c n{number[i]} N{number[j]} x{x:.4f} y{y:.4f} X{X:.4f} Y{Y:.4f} t0"
-            for (x, y), (X, Y) in zip(first, second, strict=True)
+            f"c n{number[pair.image1]} N{number[pair.image2]} x{x:.4f} y{y:.4f} X{X:.4f} Y{Y:.4f} t0"
+            for (x, y), (X, Y) in zip(link.points1.tolist(), link.points2.tolist(), strict=True)
         ]
     return lines
 
@@ -144,8 +137,3 @@ def _seen_on(canvas: Canvas) -> FloatArray:
     places = np.stack([*np.meshgrid(across, down), np.ones((_SAMPLES, _SAMPLES))])
     x, y, _ = np.tensordot(np.linalg.inv(canvas.matrix), places, axes=1)
     return np.stack(np.broadcast_arrays(*canvas.projection.directions(x, y)))
-
-
-def _in_file(points: FloatArray, upright: Camera, camera: Camera, orientation: int) -> FloatArray:
-    """Pixels (N, 2) of an upright image as pixels of its file."""
-    return camera.denormalize(upright.normalize(points) @ turning_matrix(orientation))

@@ -88,7 +88,7 @@ class CameraRecord(LensRecord):
         return replace(
             lens,
             focal_source=source,
-            distortion_std=self.lambda_std if self.lambda_observable else math.inf,
+            distortion_std=self.lambda_std or None if self.lambda_observable else math.inf,  # 0 of earlier versions
             lens_covariance=self.lens_covariance,
             focal_std=std,
             tilt=_converted(math.radians, self.tilt_deg),

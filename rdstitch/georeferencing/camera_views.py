@@ -3,12 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import to_plane
 
@@ -38,19 +38,14 @@ class Views:
     tilt_std: float = 0.0  # of the tilt that all images share, by their own axes, radians
 
     @classmethod
-    def of_ground(cls, points: ComplexArray) -> "Views":
+    def of_ground(cls, points: ComplexArray, pixel: float) -> Self:
         """Of points on the ground."""
-        return cls(points, points, np.full(len(points), np.nan), np.ones_like(points), "points")
+        return cls(points, points, np.full(len(points), np.nan), np.ones_like(points), "points", pixel)
 
-    @property
-    def usable(self) -> BoolArray:
-        """Which of them are in the output (N,)."""
-        return np.isfinite(self.foot)
-
-    def of(self, chosen: BoolArray) -> "Views":
+    def take(self, chosen: BoolArray | IntArray) -> Self:
         """Some of them."""
-        picked: dict[str, Any] = {n: getattr(self, n)[chosen] for n in ("ground", "foot", "height", "right")}
-        return replace(self, **picked)
+        columns: dict[str, Any] = {name: getattr(self, name)[chosen] for name in ("ground", "foot", "height", "right")}
+        return replace(self, **columns)
 
 
 def views_of(

@@ -4,13 +4,15 @@ The output is a plane seen straight from above, so that a similarity takes its p
 :mod:`rdstitch.georeferencing.map_fit` for how it is fitted.
 """
 
+import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
+from msgspec import Struct, field
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import FloatArray
@@ -21,23 +23,28 @@ from rdstitch.io.tiff import ExtraTag
 PositionKind = Literal["GPS positions", "ground control points"]
 GPS: PositionKind = "GPS positions"
 CONTROL: PositionKind = "ground control points"
-MODEL_SCALE, MODEL_TIEPOINT, MODEL_TRANSFORMATION, GEO_KEYS = 33550, 33922, 34264, 34735
+_MODEL_SCALE, _MODEL_TIEPOINT, _MODEL_TRANSFORMATION, _GEO_KEYS = 33550, 33922, 34264, 34735
 _SHORT, _DOUBLE = 3, 12
 
 
-@dataclass(frozen=True)
-class Residual:
+class Residual(Struct, frozen=True):
     """How far east and north of a position, of an image or a point, the map has it by all others, m."""
 
     name: str
-    east: float
-    north: float
+    # east, north: None where the map does not reach the position, or the output does not show it
+    east: float | None = field(name="east_m")
+    north: float | None = field(name="north_m")
     used: bool
 
+    @classmethod
+    def of(cls, name: str, error: complex, used: bool) -> Self:
+        """From east + i north, which is not finite where it is not known."""
+        return cls(name, error.real, error.imag, used) if cmath.isfinite(error) else cls(name, None, None, False)
+
     @property
-    def off(self) -> float:
-        """The distance, m."""
-        return math.hypot(self.east, self.north)
+    def distance(self) -> float:
+        """How far that is, m; 0 where it is not known."""
+        return math.hypot(self.east or 0.0, self.north or 0.0)
 
 
 @dataclass(frozen=True)
@@ -47,8 +54,8 @@ class Georeference:
     crs: Crs
     scale: complex  # metres per pixel times the turn: easting + i northing = ``scale`` (x - i y) + ``origin``
     origin: complex  # easting + i northing of the centre of the top-left pixel, m
-    # root mean square distance of the positions used from where all others and the images put them, m
-    rms: float
+    # root mean square distance of the positions used from where all others and the images put them, m; None of a grid
+    rms: float | None = None
     source: PositionKind = GPS  # what the positions are
     residuals: tuple[Residual, ...] = ()  # of every position
     # standard deviation of one coordinate of a place on the ground, in the mean over the positions, m
@@ -63,9 +70,9 @@ class Georeference:
         return sum(residual.used for residual in self.residuals)
 
     @property
-    def rejected(self) -> tuple[tuple[str, float], ...]:
-        """Names of images, or control points, whose positions were not used, and how far these are off, m."""
-        return tuple((residual.name, residual.off) for residual in self.residuals if not residual.used)
+    def rejected(self) -> tuple[Residual, ...]:
+        """Of the positions that were not used."""
+        return tuple(residual for residual in self.residuals if not residual.used)
 
     @property
     def gsd(self) -> float:
@@ -130,13 +137,13 @@ class Georeference:
         keys = (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, self.crs.epsg)
         if self.north_up:  # as more programs read it
             place = [
-                (MODEL_SCALE, _DOUBLE, 3, (a, a, 0.0), True),
-                (MODEL_TIEPOINT, _DOUBLE, 6, (0.0, 0.0, 0.0, corner.real, corner.imag, 0.0), True),
+                (_MODEL_SCALE, _DOUBLE, 3, (a, a, 0.0), True),
+                (_MODEL_TIEPOINT, _DOUBLE, 6, (0.0, 0.0, 0.0, corner.real, corner.imag, 0.0), True),
             ]
         else:
             matrix = (a, b, 0.0, corner.real, b, -a, 0.0, corner.imag, *(0.0,) * 7, 1.0)
-            place = [(MODEL_TRANSFORMATION, _DOUBLE, len(matrix), matrix, True)]
-        return [*place, (GEO_KEYS, _SHORT, len(keys), keys, True)]
+            place = [(_MODEL_TRANSFORMATION, _DOUBLE, len(matrix), matrix, True)]
+        return [*place, (_GEO_KEYS, _SHORT, len(keys), keys, True)]
 
     def world_file_texts(self) -> tuple[str, str]:
         """The contents of :func:`world_file_paths`."""
@@ -160,11 +167,11 @@ def map_summary(place: Georeference) -> str:
     """What there is to say of a georeference, in one line."""
     side = "left" if place.clockwise_deg > 0 else "right"
     turned = "" if place.north_up else f", north {abs(place.clockwise_deg):.1f}° {side} of up"
-    what, agree = ("GPS", "agree with the map") if place.source == GPS else (place.source, "agree")
-    text = (
-        f"georeferenced: {place.crs.name}, {place.gsd:.4g} m a pixel{turned}; {what} {agree} to "
-        f"{metres(place.rms)} ({place.used} of {len(place.residuals)}, each predicted by the others)"
-    )
+    text = f"georeferenced: {place.crs.name}, {place.gsd:.4g} m a pixel{turned}"
+    if place.rms is not None:
+        agreeing = "GPS agree with the map" if place.source == GPS else f"{place.source} agree"
+        count = f"{place.used} of {len(place.residuals)}"
+        text += f"; {agreeing} to {metres(place.rms)} ({count}, each predicted by the others)"
     if place.source == CONTROL:
         text += f", worst {_worst(place, place.residuals)}"
     return text if place.std is None else f"{text}; map ± {metres(place.std)}"
@@ -172,14 +179,17 @@ def map_summary(place: Georeference) -> str:
 
 def check_summary(place: Georeference) -> str:
     """How far check points are off, in one line."""
-    rms = math.sqrt(sum(check.off**2 for check in place.checks) / max(len(place.checks), 1))
-    worst = _worst(place, place.checks)
-    return f"{len(place.checks)} check points: {metres(rms)} off horizontally (rms), worst {worst}"
+    seen = [check for check in place.checks if check.used]
+    if not seen:
+        return f"none of {len(place.checks)} check points is in the output"
+    rms = math.sqrt(sum(check.distance**2 for check in seen) / len(seen))
+    worst = _worst(place, seen)
+    return f"{len(seen)} check points: {metres(rms)} off horizontally (rms), worst {worst}"
 
 
 def _worst(place: Georeference, residuals: Sequence[Residual]) -> str:
-    worst = max((one for one in residuals if one.used), key=lambda one: one.off)
-    return f"{worst.name} by {metres(worst.off)} = {worst.off / abs(place.scale):.1f} pixels"
+    worst = max((one for one in residuals if one.used), key=lambda one: one.distance)
+    return f"{worst.name} by {metres(worst.distance)} = {worst.distance / abs(place.scale):.1f} pixels"
 
 
 def metres(value: float) -> str:

@@ -58,11 +58,6 @@ class Measured:
     leverage: FloatArray  # (N,): how far they have put themselves where the views are already, 0 to 1
     map_scale: float = 1.0  # metres of the map per metre on the ground
 
-    def of(self, wanted: BoolArray) -> "Measured":
-        """Some of them."""
-        places, altitude = self.places[wanted], self.altitude[wanted]
-        return Measured(places, altitude, self.std[wanted], self.leverage[wanted], self.map_scale)
-
     @property
     def has_std(self) -> bool:
         """Whether the accuracy of any is known."""

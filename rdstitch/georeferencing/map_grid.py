@@ -8,18 +8,12 @@ import numpy as np
 
 from rdstitch.errors import InputError
 from rdstitch.geometry.crs import Crs, NotMetricError
-from rdstitch.georeferencing.georeference import (
-    GEO_KEYS,
-    MODEL_SCALE,
-    MODEL_TIEPOINT,
-    MODEL_TRANSFORMATION,
-    Georeference,
-)
+from rdstitch.georeferencing.georeference import Georeference
 from rdstitch.io.opening import check_readable, decoding
 from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile
 
-_PROJECTED, _RASTER_TYPE, _IS_POINT = 3072, 1025, 2
+_IS_POINT = 2  # GTRasterTypeGeoKey
 _SIMILAR = 1e-6  # relative: rounding of numbers in files
 
 
@@ -48,7 +42,7 @@ def grid_of_extent(crs: Crs, extent: tuple[float, float, float, float], pixel: f
     """North-up pixels of a size, m on the map, from the north-west corner of an extent."""
     west, south, east, north = extent
     size = (math.ceil((east - west) / pixel - _SIMILAR), math.ceil((north - south) / pixel - _SIMILAR))
-    return MapGrid(size, Georeference(crs, complex(pixel), complex(west + pixel / 2, north - pixel / 2), 0.0))
+    return MapGrid(size, Georeference(crs, complex(pixel), complex(west + pixel / 2, north - pixel / 2)))
 
 
 def read_grid(file: str | Path) -> MapGrid:
@@ -57,22 +51,14 @@ def read_grid(file: str | Path) -> MapGrid:
     check_readable(path)
     with decoding(path), open_regular(path) as stream, tifffile.TiffFile(stream, name=str(path)) as tiff:
         page = tiff.pages.first
-        size = int(page.imagewidth), int(page.imagelength)
-        tags = {
-            code: page.tags[code].value
-            for code in (MODEL_SCALE, MODEL_TIEPOINT, MODEL_TRANSFORMATION, GEO_KEYS)
-            if code in page.tags
-        }
-        keys = np.array(tags.get(GEO_KEYS, ()), dtype=np.int64).reshape(-1, 4)[1:]
-        values = {int(key): int(value) for key, location, _, value in keys if location == 0}
-        epsg = values.get(_PROJECTED, 0)
-        if MODEL_TRANSFORMATION in tags:
-            matrix = np.array(tags[MODEL_TRANSFORMATION], dtype=np.float64).reshape(4, 4)[:2, [0, 1, 3]]
-        elif MODEL_SCALE in tags and MODEL_TIEPOINT in tags:
-            (sx, sy), (i, j, _, x, y) = tags[MODEL_SCALE][:2], tags[MODEL_TIEPOINT][:5]
+        size, tags = (int(page.imagewidth), int(page.imagelength)), page.geotiff_tags or {}
+        epsg = int(tags.get("ProjectedCSTypeGeoKey", 0))
+        matrix = np.zeros((2, 3))
+        if "ModelTransformation" in tags:
+            matrix = np.array(tags["ModelTransformation"], dtype=np.float64).reshape(4, 4)[:2, [0, 1, 3]]
+        elif "ModelPixelScale" in tags and "ModelTiepoint" in tags:
+            (sx, sy), (i, j, _, x, y) = tags["ModelPixelScale"][:2], np.ravel(tags["ModelTiepoint"])[:5]
             matrix = np.array([[sx, 0.0, x - i * sx], [0.0, -sy, y + j * sy]])
-        else:
-            matrix = np.zeros((2, 3))
     scale = complex(matrix[0, 0], matrix[0, 1])
     square = abs(scale) > 0.0 and abs(matrix[1, 0] - scale.imag) + abs(matrix[1, 1] + scale.real) < _SIMILAR * abs(
         scale
@@ -84,6 +70,6 @@ def read_grid(file: str | Path) -> MapGrid:
     except NotMetricError as error:
         raise InputError(f"{file}: {error}") from error
     origin = complex(matrix[0, 2], matrix[1, 2])
-    if values.get(_RASTER_TYPE) != _IS_POINT:  # counted from the corner of the first pixel
+    if tags.get("GTRasterTypeGeoKey") != _IS_POINT:  # counted from the corner of the first pixel
         origin += scale * (0.5 - 0.5j)
-    return MapGrid(size, Georeference(crs, scale, origin, 0.0))
+    return MapGrid(size, Georeference(crs, scale, origin))

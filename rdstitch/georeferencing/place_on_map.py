@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import WGS84, Crs, middle
 from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import to_plane
@@ -31,133 +30,143 @@ def has_place(sources: Sequence[Source]) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Located:
-    """Registered images, and what is known of where they are."""
+class AlignmentErrors:
+    """What the alignment of N images says of its own errors."""
 
-    positions: Sequence[GpsPosition | None]
-    cameras: Sequence[Camera]
-    to_output: FloatArray  # (N, 3, 3): normalized undistorted coordinates of each image to pixels of the output
-    names: Sequence[str]
-    nadirs: Sequence[tuple[float, float, float] | None]  # straight down by each camera's attitude, where known
-    control: Sequence[Sequence[GroundControl]] = ()
     relief: float = 0.0  # pixels of the images that neighbours are off together: hills on what is mapped as a plane
-    lever_std: float = 0.0  # how far hills move the ground against what is below the cameras, in heights; 0: not known
-    # how far positions, by the number of their image, and control points, by name, put themselves where the images are
-    leverage: Mapping[int | str, float] = field(default_factory=dict)
+    # how far hills move the ground against what is below the cameras, in heights; None where that is not known
+    lever_std: float | None = None
+    # how far positions, of the images and of control points by name, put themselves where the images are, 0 to 1
+    leverage: Sequence[float] = ()
+    control_leverage: Mapping[str, float] = field(default_factory=dict)
 
 
-def place_on_map(located: Located, epsg: int | None = None, *, force: bool = False) -> tuple[Georeference | None, str]:
+def place_on_map(
+    sources: Sequence[Source],
+    to_output: FloatArray,
+    errors: AlignmentErrors,
+    epsg: int | None = None,
+    *,
+    force: bool = False,
+) -> tuple[Georeference | None, str]:
     """Place the output on the Earth, or say why that cannot be done; control points, where there are any, count alone.
 
-    Without ``epsg`` the map is that of the control points, else UTM (UPS near the poles) on WGS 84. With ``force``
-    positions that the images contradict place it too, and the reason says so.
+    ``sources`` are the N images that are used, with the cameras that were found; ``to_output`` (N, 3, 3) leads from
+    normalized undistorted coordinates of each to pixels of the output. Without ``epsg`` the map is that of the control
+    points, else UTM (UPS near the poles) on WGS 84. With ``force`` positions that the images contradict place it too,
+    and the reason says so.
     """
-    points = [point for shown in located.control for point in shown]
-    return (_by_control if any(not p.check for p in points) else _by_positions)(located, epsg, force)
-
-
-def _by_positions(located: Located, epsg: int | None, force: bool) -> tuple[Georeference | None, str]:
-    known = np.array([place is not None for place in located.positions])
-    places = [place for place in located.positions if place is not None]
-    if len(places) < MIN_POSITIONS:
-        count = f"{len(places)} of {len(known)} images have a GPS position"
-        return None, f"{count}, and {MIN_POSITIONS} are needed"
-    different = len({(place.latitude, place.longitude) for place in places})
-    if different == 1:
-        return None, "all images have the same GPS position"
-    views = views_of(located.cameras, located.to_output, located.nadirs).of(known)
-    std = np.array([(np.nan, np.nan) if place.std is None else place.std for place in places])
-    names = [name for name, is_known in zip(located.names, known.tolist(), strict=True) if is_known]
-    leverage = [located.leverage.get(k, 0.0) for k in np.flatnonzero(known).tolist()]
-    altitude = np.array([np.nan if place.altitude is None else place.altitude for place in places])
-    return _placed(located, views, _MeasuredPlaces(GPS, names, places, altitude, std, leverage), epsg, force)
-
-
-def _by_control(located: Located, epsg: int | None, force: bool) -> tuple[Georeference | None, str]:
-    # A control point that several images show counts once, at the mean of where they have it.
-    shown: dict[tuple[str, bool], list[tuple[GroundControl, complex]]] = {}
-    for k, points in enumerate(located.control):
-        for point in points:
-            pixel = as_complex(to_plane(located.cameras[k], located.to_output[k], np.array([point.pixel])))[0]
-            shown.setdefault((point.name, point.check), []).append((point, complex(pixel)))
-    means = {
-        key: (same[0][0], complex(np.mean([pixel for _, pixel in same if np.isfinite(pixel)] or [np.nan])))
-        for key, same in shown.items()
-    }
-    control = [mean for (_, check), mean in means.items() if not check]
-    checks = [mean for (_, check), mean in means.items() if check]
+    views = views_of([source.camera for source in sources], to_output, [source.down for source in sources])
+    points = _control_points(sources, to_output)
+    control = {point.name: (point, pixel) for point, pixel in points if not point.check}
+    if not control:
+        known = _of_positions(sources, views, errors)
+        if len(known.places) < MIN_POSITIONS:
+            count = f"{len(known.places)} of {len(sources)} images have a GPS position"
+            return None, f"{count}, and {MIN_POSITIONS} are needed"
+        return _placed(known, errors, epsg, force)
     if len(control) < MIN_POSITIONS:
         return None, f"{len(control)} {CONTROL} are in the images, and {MIN_POSITIONS} are needed"
-    if epsg is None and control[0][0].epsg != WGS84:
-        epsg = control[0][0].epsg
-    seen = views_of(located.cameras, located.to_output, located.nadirs)
-    views = replace(Views.of_ground(np.array([pixel for _, pixel in control])), pixel=seen.pixel)
-    std = np.array([[np.nan if point.std is None else point.std] * 2 for point, _ in control])
-    names, places = [point.name for point, _ in control], [point.place for point, _ in control]
-    leverage = [located.leverage.get(name, 0.0) for name in names]
-    measured = _MeasuredPlaces(CONTROL, names, places, np.full(len(names), np.nan), std, leverage)
-    place, reason = _placed(located, views, measured, epsg, force)
+    system = next(iter(control.values()))[0].epsg
+    if epsg is None and system != WGS84:
+        epsg = system
+    place, reason = _placed(_of_control(list(control.values()), views, errors), errors, epsg, force)
+    checks = [(point, pixel) for point, pixel in points if point.check]
     if place is None or not checks:
         return place, reason
-    latitude, longitude = np.array([(p.place.latitude, p.place.longitude) for p, _ in checks]).T
-    right = place.crs.project(latitude, longitude)
-    off = place.to_map([(pixel.real, -pixel.imag) for _, pixel in checks]) - right
-    residuals = [
-        Residual(p.name, east, north, True) for (p, _), (east, north) in zip(checks, off.tolist(), strict=True)
-    ]
+    latitude, longitude = np.array([(point.place.latitude, point.place.longitude) for point, _ in checks]).T
+    off = place.to_map([(pixel.real, -pixel.imag) for _, pixel in checks]) - place.crs.project(latitude, longitude)
+    residuals = (Residual.of(p.name, complex(*error), True) for (p, _), error in zip(checks, off.tolist(), strict=True))
     return replace(place, checks=tuple(residuals)), reason
 
 
 @dataclass(frozen=True, eq=False)
-class _MeasuredPlaces:
-    """What places the output: positions of N images, or control points."""
+class _KnownPlaces:
+    """N places that are known: of cameras, or of control points."""
 
     source: PositionKind
     names: Sequence[str]
     places: Sequence[GpsPosition]
-    altitude: FloatArray  # altitude, std, leverage: as :class:`rdstitch.georeferencing.map_fit.Measured` has them
-    std: FloatArray
-    leverage: Sequence[float]
+    views: Views
+    leverage: FloatArray  # (N,)
+
+
+def _of_positions(sources: Sequence[Source], views: Views, errors: AlignmentErrors) -> _KnownPlaces:
+    places = {k: source.metadata.gps for k, source in enumerate(sources) if source.metadata.gps is not None}
+    known = np.array(list(places), dtype=np.intp)
+    leverage = np.array(errors.leverage or [0.0] * len(sources))[known]
+    return _KnownPlaces(GPS, [sources[k].name for k in places], list(places.values()), views.take(known), leverage)
+
+
+def _of_control(
+    control: Sequence[tuple[GroundControl, complex]], views: Views, errors: AlignmentErrors
+) -> _KnownPlaces:
+    stds = [None if point.std is None else (point.std, point.std) for point, _ in control]
+    places = [replace(point.place, altitude=None, std=std) for (point, _), std in zip(control, stds, strict=True)]
+    names = [point.name for point, _ in control]
+    leverage = np.array([errors.control_leverage.get(name, 0.0) for name in names])
+    ground = Views.of_ground(np.array([pixel for _, pixel in control]), views.pixel)
+    return _KnownPlaces(CONTROL, names, places, ground, leverage)
+
+
+def _control_points(sources: Sequence[Source], to_output: FloatArray) -> list[tuple[GroundControl, complex]]:
+    """Each point once, with its place in the output: where several images show it, at the mean of these."""
+    shown: dict[tuple[str, bool], list[tuple[GroundControl, complex]]] = {}
+    for source, homography in zip(sources, to_output, strict=True):
+        for point in source.control:
+            pixel = as_complex(to_plane(source.camera, homography, np.array([point.pixel])))[0]
+            shown.setdefault((point.name, point.check), []).append((point, complex(pixel)))
+    return [
+        (same[0][0], complex(np.mean([pixel for _, pixel in same if np.isfinite(pixel)] or [np.nan])))
+        for same in shown.values()
+    ]
 
 
 def _placed(
-    located: Located, views: Views, measured: _MeasuredPlaces, epsg: int | None, force: bool
+    known: _KnownPlaces, errors: AlignmentErrors, epsg: int | None, force: bool
 ) -> tuple[Georeference | None, str]:
-    latitude, longitude = np.array([(place.latitude, place.longitude) for place in measured.places]).T
+    source, names, views = known.source, known.names, known.views
+    latitude, longitude = np.array([(place.latitude, place.longitude) for place in known.places]).T
+    if source == GPS and not (np.ptp(latitude) or np.ptp(longitude)):
+        return None, "all images have the same GPS position"
     crs = Crs.nearest(latitude, longitude) if epsg is None else Crs(epsg)
     map_scale = crs.map_scale(*middle(latitude, longitude))
     places = crs.project(latitude, longitude) @ np.array([1, 1j])
-    usable: BoolArray = np.isfinite(places) & views.usable
-    source, names = measured.source, measured.names
+    usable: BoolArray = np.isfinite(places) & np.isfinite(views.foot)
     if usable.sum() < MIN_POSITIONS:
         return None, f"{crs.name} does not reach the {source}"
-    on_map = Measured(places, measured.altitude, measured.std, np.array(measured.leverage), map_scale)
-    fit = fit_map(views.of(usable), on_map.of(usable))
-    used = np.zeros(len(names), dtype=bool)
-    used[usable] = fit.used
-    off = np.full(len(names), complex(np.inf))
-    off[usable] = fit.left_out
+    altitude = np.array([np.nan if place.altitude is None else place.altitude for place in known.places])
+    std = np.array([(np.nan, np.nan) if place.std is None else place.std for place in known.places])
+    measured = Measured(places[usable], altitude[usable], std[usable], known.leverage[usable], map_scale)
+    fit = fit_map(views.take(usable), measured)
+    used, off = np.zeros(len(names), dtype=bool), np.full(len(names), complex(np.nan))
+    used[usable], off[usable] = fit.used, fit.left_out
     if not used.any():
         return None, f"no scale and direction of the map fit the {source} and the places of the images"
     rms = math.sqrt(float(np.mean(np.abs(off[used]) ** 2)))
     spread = math.sqrt(float(np.mean(np.abs(places[used] - places[used].mean()) ** 2)))
     reason = ""
     if used.sum() < max(MIN_POSITIONS, len(names) / 2) or not rms < _MAX_ERROR * spread:
-        median = float(np.median(np.abs(off)))
+        median = float(np.median(np.where(usable, np.abs(off), np.inf)))
         reason = (
             f"the {source} contradict the images: half of them are {metres(median)} or more from where the images put "
             f"them, which is much in an area of {metres(2.0 * spread)}"
         )
         if not force:
             return None, f"{reason}; --georeference force places it nevertheless"
-    residuals = tuple(Residual(n, e.real, e.imag, u) for n, e, u in zip(names, off, used.tolist(), strict=True))
-    assumption = _assumption(views, fit) if source == GPS else ""
-    hills = located.relief * views.pixel
-    if located.lever_std and np.isfinite(views.height).any():
-        hills = located.lever_std * float(np.nanmedian(views.height))
-    std = None if fit.std is None else math.hypot(fit.std, hills * abs(fit.scale))
+    hills = errors.relief * views.pixel
+    if errors.lever_std is not None and np.isfinite(views.height).any():
+        hills = errors.lever_std * float(np.nanmedian(views.height))
     place = Georeference(
-        crs, fit.scale, fit.origin, rms, source, residuals, std, map_scale=map_scale, assumption=assumption
+        crs,
+        fit.scale,
+        fit.origin,
+        rms,
+        source,
+        residuals=tuple(map(Residual.of, names, off.tolist(), used.tolist())),
+        std=None if fit.std is None else math.hypot(fit.std, hills * abs(fit.scale)),
+        map_scale=map_scale,
+        assumption=_assumption(views, fit) if source == GPS else "",
     )
     return place, reason
 

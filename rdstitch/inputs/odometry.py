@@ -60,12 +60,18 @@ class Odometry:
 
     times: FloatArray  # (M,), s, ascending
     poses: FloatArray  # (M, 5): as in BodyPose, the yaw continuous
+    name: str  # of its file, or topic
 
     def at(self, time: float) -> BodyPose | None:
         """The pose at a time, interpolated; None beyond what was measured, and in gaps."""
         if not self.times[0] <= time <= self.times[-1] or in_gap(self.times, np.array([time]))[0]:
             return None
         return BodyPose(*(float(np.interp(time, self.times, values)) for values in self.poses.T))
+
+
+def as_odometry(given: "Odometry | str | Path | None") -> Odometry | None:
+    """The odometry that is given, of a file what it holds now."""
+    return given if given is None or isinstance(given, Odometry) else read_odometry(given)
 
 
 @cached_by_file_state
@@ -111,7 +117,7 @@ def odometry_of(rows: Sequence[tuple[float, ...]], where: str) -> Odometry:
     if len(values) < 2:
         raise InputError(f"{where}: has no odometry at two times")
     values[:, 3] = np.unwrap(values[:, 3])
-    return Odometry(values[:, 0], values[:, 1:])
+    return Odometry(values[:, 0], values[:, 1:], where)
 
 
 def unit_quaternion(parts: Sequence[float], where: str) -> tuple[float, float, float, float]:

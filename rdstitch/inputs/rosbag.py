@@ -3,7 +3,7 @@
 Their images are read by :mod:`rdstitch.inputs.rosbag_images`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ import numpy as np
 
 from rdstitch.errors import InputError, RdstitchError
 from rdstitch.geometry.camera import Camera
+from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.odometry import Odometry, odometry_of, unit_quaternion, yaw_of
 from rdstitch.system.file_access import read_beginning
 
@@ -35,6 +36,12 @@ def is_bag(path: Path) -> bool:
         return _KEY in read_beginning(path / _DESCRIPTION, _HEADER)
     except OSError:
         return False
+
+
+def only_bag(inputs: Iterable[Named]) -> Path | None:
+    """The bag that is the only input, if one is."""
+    named = [Path(item) for item in inputs if not isinstance(item, Frame)]
+    return named[0] if len(named) == 1 and is_bag(named[0]) else None
 
 
 @contextmanager

@@ -2,6 +2,6 @@
 
 from rdstitch.local_alignment.estimate import HeldOut, LocalAlignment, align_locally, no_local_alignment
 from rdstitch.local_alignment.field import DisplacementField
-from rdstitch.local_alignment.matches import Match
+from rdstitch.local_alignment.matches import PutativeMatches
 
-__all__ = ["DisplacementField", "HeldOut", "LocalAlignment", "Match", "align_locally", "no_local_alignment"]
+__all__ = ["DisplacementField", "HeldOut", "LocalAlignment", "PutativeMatches", "align_locally", "no_local_alignment"]

@@ -14,7 +14,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField
 from rdstitch.local_alignment.fit import PlacedFields, Stiffness, fit_fields
 from rdstitch.local_alignment.ground import fit_ground
-from rdstitch.local_alignment.matches import ImagesOnSurface, Match, PlacedMatches, place_matches
+from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches, PutativeMatches, place_matches
 
 _COARSE = 12, 120_000  # cells of a grid that finds what is far from the plane; nodes of all images at most
 _FINE = 24, 40_000  # the same of the grid that is used: it is coarser for more than some 70 images
@@ -66,7 +66,7 @@ def no_local_alignment(reason: str) -> LocalAlignment:
 
 
 def align_locally(
-    matches: Iterable[Match],
+    matches: Iterable[PutativeMatches],
     cameras: Sequence[Camera],
     homographies: FloatArray,
     choice: Literal["auto"] | int = "auto",

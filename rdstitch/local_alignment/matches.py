@@ -23,7 +23,7 @@ _MIN_MATCHES = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Match:
+class PutativeMatches:
     """Putative matches of one pair of images: measured pixels (N, 2) of either."""
 
     image1: int
@@ -150,7 +150,7 @@ class PlacedMatches(Rows):
         return self if count == len(self) else self.take(np.linspace(0, len(self) - 1, count).astype(np.intp))
 
 
-def place_matches(matches: Iterable[Match], images: ImagesOnSurface) -> Iterator[PlacedMatches]:
+def place_matches(matches: Iterable[PutativeMatches], images: ImagesOnSurface) -> Iterator[PlacedMatches]:
     """Place the matches of each pair that lie near each other: inliers of the alignment, and a little farther off.
 
     Pairs that have hardly any are left out.

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from rdstitch.choices import SolverName
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import Options, option
+from rdstitch.options.option import Options, Range, option
 
 
 @dataclass(frozen=True)
@@ -17,14 +17,13 @@ class RansacOptions(Options):
         3.0,
         "Largest error of an inlier, pixels of the size that features are detected at (see --work-megapixels).",
         "PX",
-        above=0.0,
-        most=1e4,  # more than an image is wide
+        within=Range(above=0.0, most=1e4),  # more than an image is wide
     )
     confidence: float = option(
-        0.999, "Probability that no better model of a pair was missed.", above=0.0, below=1.0, command_line=False
+        0.999, "Probability that no better model of a pair was missed.", within=Range(above=0.0, below=1.0), flag=None
     )
-    max_iterations: int = option(10000, "Samples a pair, over all solvers.", least=1, command_line=False)
-    seed: int = option(0, "Random seed.", least=0)
+    max_iterations: int = option(10000, "Samples a pair, over all solvers.", within=Range(least=1), flag=None)
+    seed: int = option(0, "Random seed.", within=Range(least=0))
 
     def refuse_solver(self) -> None:
         """Refuse a solver where λ is known: which one is used depends on nothing else then."""

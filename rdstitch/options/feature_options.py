@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 from rdstitch.choices import FeatureName
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import Options, documented, option
+from rdstitch.options.option import FileUse, Options, Range, documented, option
 
 WORK_MEGAPIXELS = 0.6  # 10⁶ pixels to which images of a large set are halved unless it is said otherwise
 MAX_FEATURES = 2000  # keypoints kept per image of a large set unless it is said otherwise
@@ -25,32 +25,32 @@ class FeatureOptions(Options):
     kind: FeatureName = option("rootsift", "Feature detector and descriptor.", flag="--features")
     max_features: int | None = option(
         None,
-        "Most features of an image.",
-        least=1,
-        default="2000; of fewer than 8 images 16000 together, at most 4000 each",
+        "Most features of an image; otherwise 2000, and of fewer than 8 images 16000 together, at most 4000 each.",
+        within=Range(least=1),
     )
     work_megapixels: float | Literal["auto"] | None = option(
         "auto",
         "Images are halved until they have no more megapixels before features are detected, once less where that "
-        "shows too few; 0 is full size.",
-        "MP",
-        least=0.0,
-        default="0.6; of fewer than 8 images 4.8 together, at most 2.4 each",
+        "shows too few; 0 is full size. auto: 0.6; of fewer than 8 images 4.8 together, at most 2.4 each.",
+        "auto|MP",
+        within=Range(least=0.0),
     )
-    spread: bool = option(True, "Keep the strongest of each cell of a grid in turn.", command_line=False)
+    spread: bool = option(True, "Keep the strongest of each cell of a grid in turn.", flag=None)
     stretch: tuple[float, float] | None = option(
         None,
         "Grey levels that become 0 and 255; None: those of the set where its images have more than 8 bits, else none.",
-        command_line=False,
+        flag=None,
     )
     equalize: bool | None = option(
         None,
         "Equalize local contrast before detection; None: of a set whose images show too little otherwise.",
-        command_line=False,
+        flag=None,
     )
-    aliked_model: str | Path | None = option(None, "ONNX file of the network of --features aliked.", "FILE", reads=True)
+    aliked_model: str | Path | None = option(
+        None, "ONNX file of the network of --features aliked.", "FILE", file=FileUse.READ
+    )
     aliked_size: int = option(
-        640, "Side of the square image that the network takes, pixels.", least=1, command_line=False
+        640, "Side of the square image that the network takes, pixels.", within=Range(least=1), flag=None
     )
 
     def __post_init__(self) -> None:

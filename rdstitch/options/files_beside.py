@@ -1,11 +1,12 @@
 """What is written beside an image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Self
 
 from rdstitch.choices import PosesFrame
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import Options, documented, option
+from rdstitch.options.option import FileUse, Options, documented, option, options_of
 from rdstitch.options.shared_options import Height
 
 _REPORT_SUFFIXES = (".html", ".htm")
@@ -13,32 +14,59 @@ _REPORT_SUFFIXES = (".html", ".htm")
 
 @documented
 @dataclass(frozen=True)
-class FilesBeside(Options):
-    """What is written beside an image, published together with it; the report of a result that is refused too."""
+class ReportFile(Options):
+    """What is written of a registration, also of one that is refused."""
 
     report: Path | None = option(
-        None, "Write a report to FILE (.html): graph, votes on λ, matches, residuals.", "FILE", writes=True
+        None, "Write a report to FILE (.html): graph, votes on λ, matches, residuals.", "FILE", file=FileUse.WRITTEN
     )
+    command: str = ""  # the command line, for the report
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.report is not None:
+            from rdstitch.system.output_checks import check_suffix
+
+            check_suffix(self.report, _REPORT_SUFFIXES)
+
+
+@documented
+@dataclass(frozen=True)
+class ImageFiles(ReportFile):
+    """What is written beside an image, whatever its images are."""
+
     layers: Path | None = option(
         None,
         "Write each image, warped, with alpha, and its mask into DIR: TIFF, cropped, with the offsets that "
         "enblend reads.",
         "DIR",
-        writes=True,
+        file=FileUse.WRITTEN,
     )
     whole_layers: bool = option(False, "With --layers: on the whole canvas instead of cropped.")
     hugin_project: Path | None = option(
         None,
         "Write a project for Hugin (.pto): all images with lens and pose, and control points.",
         "FILE",
-        writes=True,
+        file=FileUse.WRITTEN,
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.whole_layers and self.layers is None:
+            raise ArgumentError("whole layers need a folder of layers: --whole-layers goes with --layers DIR")
+
+
+@documented
+@dataclass(frozen=True)
+class FilesBeside(ImageFiles):
+    """What is written beside an image, published together with it; the report of a result that is refused too."""
+
     poses: Path | None = option(
         None,
         "Write the pose of the camera for each image: CSV with covariances, as 'rdstitch trajectory' does; "
         "images.txt: COLMAP's; geo.txt: OpenDroneMap's.",
         "FILE",
-        writes=True,
+        file=FileUse.WRITTEN,
     )
     frame: PosesFrame = option(
         "enu",
@@ -52,18 +80,25 @@ class FilesBeside(Options):
         "Write map.yaml and map.png, which nav2_map_server loads, into DIR; in metres by --height, with the first "
         "image at the origin and its top along x.",
         "DIR",
-        writes=True,
+        file=FileUse.WRITTEN,
     )
-    command: str = ""  # the command line, for the report
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.whole_layers and self.layers is None:
-            raise ArgumentError("whole layers need a folder of layers: --whole-layers goes with --layers DIR")
-        if self.report is not None:
-            from rdstitch.system.output_checks import check_suffix
+    @property
+    def has_poses_on_map(self) -> bool:
+        """Whether the table of poses needs a map: also OpenDroneMap's, by its name; COLMAP's takes it where it is."""
+        name = "" if self.poses is None else self.poses.name.lower()
+        return name == "geo.txt" or (self.frame == "map" and name not in ("", "images.txt"))
 
-            check_suffix(self.report, _REPORT_SUFFIXES)
+    @classmethod
+    def of(cls, kind: type[ReportFile], given: ReportFile, recipe: str) -> Self:
+        """All files from those of a kind; others are refused, which a recipe does not write."""
+        whole = cls(**vars(options_of(kind, given, "beside")))
+        of_kind = {each.name for each in fields(kind)}
+        for each in fields(cls):
+            if each.name not in of_kind and getattr(whole, each.name) != each.default:
+                written = ", ".join(sorted(of_kind - {"command", "whole_layers"}))
+                raise ArgumentError(f"{recipe} writes no {each.name}: beside its result there may be {written}")
+        return whole
 
 
 NOTHING_BESIDE = FilesBeside()

@@ -1,4 +1,4 @@
-"""An option is declared once, as an annotated field: ``gsd: float = option(1.0, "Metres a pixel.", "M", above=0)``.
+"""An option is declared once, as an annotated field: ``gsd: float = option(1.0, "Metres a pixel.", "M")``.
 
 Of one that stands in several classes, or is a parameter, the type says it: ``Annotated[float, Option("Metres.")]``.
 From this its value is checked, the documentation of its class is made, and the command line with its help. Nothing
@@ -8,6 +8,7 @@ large is imported here or by the modules of the options, so that ``--help`` is q
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from enum import Enum, StrEnum, auto
 from inspect import isclass
 from itertools import chain
 from numbers import Integral, Real
@@ -22,41 +23,61 @@ Class = TypeVar("Class", bound=type)
 AnyOptions = TypeVar("AnyOptions", bound="Options")
 
 
-@dataclass(frozen=True)
-class Option:
-    """What is said of an option besides its type and its default; the limits hold for every number in it."""
+class FileUse(Enum):
+    """What is done with the file or folder that an option names."""
 
-    text: str  # {unit} in it stands for "radians" in Python, and for "degrees" on the command line
-    metavar: str = ""  # what help pages call the value; empty: by its type
-    flag: str = ""  # as "--lambda", "-j --workers" or "--crop/--no-crop"; empty: by the name of the field
+    READ = auto()
+    WRITTEN = auto()
+
+
+class Unit(StrEnum):
+    """Of numbers that are entered in another way on the command line: as degrees, and as 800M."""
+
+    RADIANS = auto()
+    DEGREES = auto()
+    BYTES = auto()
+
+
+@dataclass(frozen=True)
+class Range:
+    """Limits of a number."""
+
     least: float = -math.inf
     above: float = -math.inf
     most: float = math.inf
     below: float = math.inf
-    unit: Literal["", "radians", "degrees", "bytes"] = ""  # entered as degrees, and as 800M, on the command line
-    none: str = ""  # the word for None on the command line
-    default: str = ""  # what help pages say of the default, where its value says too little
-    entered: Any = None  # the type on the command line, where that of the field is another one
-    reads: bool = False  # whether it names a file or folder that is read
-    writes: bool = False  # the same of one that is written
-    command_line: bool = True
-    pixels: bool = False  # whether it says which pixels the output has
 
-    def in_unit(self, unit: str) -> str:
-        """The text, of angles in a unit."""
-        return self.text.replace("{unit}", unit)
-
-    def allows(self, number: float) -> bool:
-        """Check a number by the limits."""
+    def __contains__(self, number: float) -> bool:
         return self.least <= number <= self.most and self.above < number < self.below and math.isfinite(number)
 
-    @property
-    def limits(self) -> str:
-        """The limits, in words."""
+    def __str__(self) -> str:
         if math.isfinite(self.least) and math.isfinite(self.most):
             return f" from {_number(self.least)} to {_number(self.most)}"
         limits = {"of at least": self.least, "above": self.above, "of at most": self.most, "below": self.below}
         return " and".join(f" {words} {_number(value)}" for words, value in limits.items() if math.isfinite(value))
+
+    @property
+    def in_degrees(self) -> "Range":
+        """The same limits of an angle in degrees."""
+        return Range(*map(math.degrees, (self.least, self.above, self.most, self.below)))
+
+
+@dataclass(frozen=True)
+class Option:
+    """What is said of an option besides its type and its default."""
+
+    text: str  # {unit} in it stands for "radians" in Python, and for "degrees" on the command line
+    metavar: str = ""  # what help pages call the value; empty: by its type
+    # as "-j --workers" or "--crop/--no-crop"; empty: by the name of the field; None: not on the command line
+    flag: str | None = ""
+    within: Range = Range()  # limits of every number in it
+    unit: Unit | None = None
+    none: str = ""  # the word for None on the command line
+    file: FileUse | None = None
+
+    def in_unit(self, unit: Unit | None) -> str:
+        """The text, of angles in a unit."""
+        return self.text.replace("{unit}", unit or "")
 
 
 def _number(value: float) -> str:
@@ -64,7 +85,7 @@ def _number(value: float) -> str:
     return f"{value:.0f}" if float(value).is_integer() else f"{value:g}"
 
 
-def option(value: Any, text: str, metavar: str = "", flag: str = "", **more: Any) -> Any:
+def option(value: Any, text: str, metavar: str = "", flag: str | None = "", **more: Any) -> Any:
     """A field of a dataclass: its default, and what :class:`Option` says of it."""
     return field(default=value, metadata={"option": Option(text, metavar, flag, **more)})
 
@@ -87,7 +108,7 @@ class Declared:
 
     def names_read(self, value: Any) -> bool:
         """Whether a value names a file or folder that is read."""
-        return self.option.reads and isinstance(value, str | PathLike) and value not in self.words
+        return self.option.file is FileUse.READ and isinstance(value, str | PathLike) and value not in self.words
 
     def fits(self, value: Any) -> bool:
         """Check a value; of texts and files only that they are none of another type."""
@@ -233,7 +254,7 @@ def _fits(value: Any, kind: Any, option: Option) -> bool:
         return len(value) == len(parts) and all(map(_fits, value, parts, [option] * len(parts)))
     if kind in (int, float):
         number = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
-        return number and option.allows(value)
+        return number and value in option.within
     if isinstance(kind, ForwardRef):  # names of classes that are not imported here; what is like an array, NumPy says
         known, names = kind.__forward_arg__.split(" | "), {base.__name__ for base in type(value).__mro__}
         return "ArrayLike" in known or isinstance(value, PathLike) or not names.isdisjoint(known)
@@ -244,13 +265,13 @@ def _in_words(kind: Any, option: Option) -> str:
     unit = f", {option.unit}," if option.unit else ""
     if get_origin(kind) is tuple:
         parts = get_args(kind)
-        return f"{len(parts)} numbers{unit}{option.limits}" if parts[-1] is not Ellipsis else "a list"
+        return f"{len(parts)} numbers{unit}{option.within}" if parts[-1] is not Ellipsis else "a list"
     if isinstance(kind, ForwardRef):
         return f"{kind.__forward_arg__.split()[0]} or a file"
     names = {
         bool: "true or false",
-        int: f"a whole number{unit}{option.limits}",
-        float: f"a number{unit}{option.limits}",
+        int: f"a whole number{unit}{option.within}",
+        float: f"a number{unit}{option.within}",
         Path: "a file",
     }
     return names.get(kind, "a text")

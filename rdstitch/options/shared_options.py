@@ -4,28 +4,25 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from rdstitch.choices import ChannelOrder
-from rdstitch.options.option import Option
+from rdstitch.options.option import FileUse, Option, Range
 
 Every = Annotated[
     int | None,
     Option(
         "Every N-th frame of a video or ROS bag; auto: frames that show new ground.",
         "auto|N",
-        least=1,
-        most=1_000_000,
+        within=Range(least=1, most=1_000_000),
         none="auto",
     ),
 ]
-ArrayChannels = Annotated[
-    ChannelOrder, Option("Order of the channels of arrays that come in or go out.", command_line=False)
-]
+ArrayChannels = Annotated[ChannelOrder, Option("Order of the channels of arrays that come in or go out.", flag=None)]
 Topic = Annotated[str | None, Option("Image topic of a ROS bag.", "NAME")]
 Mask = Annotated[
     str | Path | None,
     Option(
         "Mask whose black pixels are excluded: a folder of masks with the images' names, or one file for all.",
         "DIR|FILE",
-        reads=True,
+        file=FileUse.READ,
     ),
 ]
 FlatField = Annotated[
@@ -33,11 +30,11 @@ FlatField = Annotated[
     Option(
         "Flat-field correction: estimated from the images, or read from FILE (second page: the dark field).",
         "auto|off|FILE",
-        reads=True,
+        file=FileUse.READ,
     ),
 ]
 Workers = Annotated[
-    int, Option("Threads; 0: one for each usable core.", "N", "-j --workers", least=0, most=1024)
+    int, Option("Threads; 0: one for each usable core.", "N", "-j --workers", within=Range(least=0, most=1024))
 ]  # more than any machine has cores for
 Overwrite = Annotated[bool, Option("Replace existing output files.")]
 Strict = Annotated[bool, Option("Fail with status 5 when an image is left out.")]
@@ -47,9 +44,10 @@ Height = Annotated[
     Option(
         "Height of the first frame above the plane, whose unit positions have; else they are in heights.",
         "H",
-        above=0.0,
+        within=Range(above=0.0),
     ),
 ]
 Distortion = Annotated[
-    float | None, Option("Known λ (half-diagonal frame); it is not estimated.", "L", "--lambda", above=-1.0, below=1.0)
+    float | None,
+    Option("Known λ (half-diagonal frame); it is not estimated.", "L", "--lambda", within=Range(above=-1.0, below=1.0)),
 ]

@@ -10,7 +10,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.estimation_options import EstimationOptions, RansacOptions
 from rdstitch.options.feature_options import FeatureOptions
-from rdstitch.options.option import Contradiction, documented, option
+from rdstitch.options.option import Contradiction, FileUse, Range, Unit, documented, option
 from rdstitch.options.shared_options import (
     ArrayChannels,
     Distortion,
@@ -52,11 +52,11 @@ class StitchOptions(RansacOptions):
     ratio: float | None = option(
         None,
         "Largest ratio of the distances to the nearest and second nearest descriptor; None: what suits the features.",
-        above=0.0,
-        command_line=False,
+        within=Range(above=0.0),
+        flag=None,
     )
     lightglue_model: str | Path | None = option(
-        None, "LightGlue network (ONNX) for these features.", "FILE", reads=True
+        None, "LightGlue network (ONNX) for these features.", "FILE", file=FileUse.READ
     )
     lens: LensName = option(
         "auto", "Lens to estimate: λ; λ and the distortion centre; besides them a second or a third coefficient."
@@ -67,63 +67,72 @@ class StitchOptions(RansacOptions):
         "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap, Hugin or lensfun; its lens is not "
         "estimated.",
         "FILE",
-        reads=True,
-        entered=Path | None,
+        file=FileUse.READ,
     )
     distortion: Distortion = None
-    focal: float | None = option(None, "Focal length, pixels; otherwise from EXIF, or a guess.", "PX", above=0.0)
+    focal: float | None = option(
+        None, "Focal length, pixels; otherwise from EXIF, or a guess.", "PX", within=Range(above=0.0)
+    )
     tilt: tuple[float, float] | None = option(
-        None, "Known tilt of the camera, {unit}.", "PSI,THETA", above=-math.pi / 2, below=math.pi / 2, unit="radians"
+        None,
+        "Known tilt of the camera, {unit}.",
+        "PSI,THETA",
+        within=Range(above=-math.pi / 2, below=math.pi / 2),
+        unit=Unit.RADIANS,
     )
     attitude: Literal["xmp"] | str | Path | None = option(
         None,
         "Tilt of each image: CSV name,psi,theta in degrees; xmp: from the XMP of drone images.",
         "FILE|xmp",
-        reads=True,
+        file=FileUse.READ,
     )
     attitude_std: float = option(
         math.radians(1.0),
         "Standard deviation of the attitudes, {unit}; 0 for exact ones.",
         "DEG",
-        least=0.0,
-        most=math.pi / 2,
-        unit="radians",
+        within=Range(least=0.0, most=math.pi / 2),
+        unit=Unit.RADIANS,
     )
     timestamps: str | Path | None = option(
         None,
         "Time stamps of the images: CSV name,timestamp, lines TIME NAME, or a time a line; otherwise those of the "
         "video, bag or EXIF.",
         "FILE",
-        reads=True,
+        file=FileUse.READ,
     )
     odometry: "Odometry | str | Path | None" = option(
         None,
         "Wheel odometry, by time: TUM's lines, CSV timestamp,x,y,yaw_deg, or a topic of the bag. It gives the unit of "
         "positions, and poses of frames without texture.",
         "FILE|TOPIC",
-        reads=True,
-        entered=str | None,
+        file=FileUse.READ,
     )
     positions: str | Path | None = option(
         None,
         "Where images were taken, instead of EXIF: CSV name,lat,lon or name,x,y (see --crs), exiftool's -csv or "
         "-json, OpenDroneMap's geo.txt, or a GPX track.",
         "FILE",
-        reads=True,
+        file=FileUse.READ,
     )
     positions_offset: float = option(0.0, "Seconds from the times of the images to those of the GPX track (UTC).", "S")
     position_accuracy: float | None = option(
-        None, "Standard deviation of a horizontal coordinate of positions that tell none, metres.", "M", above=0.0
+        None,
+        "Standard deviation of a horizontal coordinate of positions that tell none, metres.",
+        "M",
+        within=Range(above=0.0),
     )
     gcp: str | Path | None = option(
         None,
         "Ground control points, as OpenDroneMap's gcp_list.txt, or CSV x,y,px,py,image,name,accuracy (see --crs); "
         "they bend the alignment, and place the output on the Earth.",
         "FILE",
-        reads=True,
+        file=FileUse.READ,
     )
     check_points: str | Path | None = option(
-        None, "Points like those of --gcp that are compared with the map, and take no part in it.", "FILE", reads=True
+        None,
+        "Points like those of --gcp that are compared with the map, and take no part in it.",
+        "FILE",
+        file=FileUse.READ,
     )
     mask: Mask = None
     channel_order: ArrayChannels = "bgr"
@@ -134,15 +143,14 @@ class StitchOptions(RansacOptions):
     topic: Topic = None
     reference: str | None = option(None, "Reference image; otherwise the best connected one.", "NAME")
     pose_covariance: bool = option(
-        False, "Compute covariances of the poses, for the sidecar and tables of poses.", command_line=False
+        False, "Compute covariances of the poses, for the sidecar and tables of poses.", flag=None
     )
     local_alignment: LocalAlignmentMode = option(
         "auto",
         "Smooth displacement of each image where the scene has depth. auto: if held-out matches come nearer; N: "
         "always, with N cells along an image's longer side.",
         "auto|off|N",
-        least=2,
-        most=100,
+        within=Range(least=2, most=100),
     )
     composite: CompositeOptions = field(default_factory=CompositeOptions)
     cache: Path | None = option(
@@ -157,7 +165,7 @@ class StitchOptions(RansacOptions):
     overwrite: Overwrite = False
     strict: Strict = False
     force: bool = option(False, "Write the result even when it fails its own checks.")
-    save_camera: Path | None = option(None, "Write the estimated camera.", "FILE", writes=True)
+    save_camera: Path | None = option(None, "Write the estimated camera.", "FILE", file=FileUse.WRITTEN)
     camera_format: CameraFormat = option(
         "auto",
         "Format of the camera file written. auto: by its name, .json (rdstitch), .yml (OpenCV), .fisheye.yml, "

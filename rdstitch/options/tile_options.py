@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from rdstitch.choices import Origin, ScanOrder, ZPlane
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.options.option import Contradiction, Options, documented, option
+from rdstitch.options.option import Contradiction, FileUse, Options, Range, documented, option
 from rdstitch.options.shared_options import DryRun, FlatField, Overwrite, Strict, Topic, Workers
 
 if TYPE_CHECKING:
@@ -39,8 +39,7 @@ class TileOptions(Options):
         "CSV with name,x,y (pixels) or name,x_um,y_um, or Fiji's TileConfiguration.txt; otherwise what OME-TIFF "
         "or Micro-Manager say.",
         "FILE",
-        reads=True,
-        entered=Path | None,
+        file=FileUse.READ,
     )
     grid: str | None = option(
         None,
@@ -48,32 +47,38 @@ class TileOptions(Options):
         "'{letter}{col}' for A01; 'img_{number}' for running numbers.",
         "PATTERN",
     )
-    columns: int | None = option(None, "With {number}: tiles in a row.", least=1)
+    columns: int | None = option(None, "With {number}: tiles in a row.", within=Range(least=1))
     order: ScanOrder = option("rows", "With {number}: how tiles follow each other; snake: to and fro.")
     origin: Origin = option("top-left", "With --grid: where the first tile is.")
-    overlap: float = option(10.0, "With --grid: overlap of neighbouring tiles.", "PERCENT", least=0.0, below=100.0)
-    pixel_size: float | None = option(None, "Pixel size, micrometres, if no file states it.", "UM", above=0.0)
+    overlap: float = option(
+        10.0, "With --grid: overlap of neighbouring tiles.", "PERCENT", within=Range(least=0.0, below=100.0)
+    )
+    pixel_size: float | None = option(
+        None, "Pixel size, micrometres, if no file states it.", "UM", within=Range(above=0.0)
+    )
     search: float | None = option(
-        None, "Search radius around the nominal offset of neighbours.", "PX", above=0.0, default="5 % of a tile's side"
+        None,
+        "Search radius around the nominal offset of neighbours; otherwise 5 % of a tile's side.",
+        "PX",
+        within=Range(above=0.0),
     )
     channel: int | None = option(
-        None, "Register this channel, from 0; otherwise the mean of all. All are composed.", least=0
+        None, "Register this channel, from 0; otherwise the mean of all. All are composed.", within=Range(least=0)
     )
     z: ZPlane | None = option(
-        None, "Plane of z stacks, from 0; otherwise the brightest sample of all planes.", "max|N", least=0
+        None, "Plane of z stacks, from 0; otherwise the brightest sample of all planes.", "max|N", within=Range(least=0)
     )
-    time: int | None = option(None, "Time of a series, from 0; otherwise the first.", least=0)
+    time: int | None = option(None, "Time of a series, from 0; otherwise the first.", within=Range(least=0))
     flat_field: FlatField = "auto"
     save_flat_field: str | Path | None = option(
-        None, "Write flat field and dark field to this TIFF file.", "FILE", writes=True
+        None, "Write flat field and dark field to this TIFF file.", "FILE", file=FileUse.WRITTEN
     )
     distortion: float | Literal["auto"] | None = option(
         None,
         "Known λ (half-diagonal frame), or auto: estimate it; otherwise 0 unless all overlaps show it.",
         "L|auto",
         "--lambda",
-        above=-1.0,
-        below=1.0,
+        within=Range(above=-1.0, below=1.0),
     )
     composite: CompositeOptions = field(default_factory=measured_samples)
     overwrite: Overwrite = False

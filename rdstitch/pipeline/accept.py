@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.alignment.motion_models import MODELS
-from rdstitch.alignment.result import Alignment, LinkFit, links_by_image
+from rdstitch.alignment.result import LinkFit, links_by_image
 from rdstitch.choices import ModelName
 from rdstitch.errors import PartialResultError
 from rdstitch.inputs.input_guard import InputGuard
@@ -14,11 +14,10 @@ from rdstitch.pipeline.aligner import Aligner, impossible_estimates_fail
 from rdstitch.pipeline.realign import Rejected, aligner_of, left_out_images, plane_of_most, without
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.working_size import at_full_size
-from rdstitch.results.messages import Message, merge_by_reason
+from rdstitch.results.messages import merge_by_reason
 from rdstitch.results.registration import Registration
 from rdstitch.verification.evidence import ResultEvidence
 from rdstitch.verification.findings import Finding, Scope, messages_of
-from rdstitch.verification.limits import Limits
 from rdstitch.verification.verdict import RefusedError, judge
 
 _MAX_ROUNDS = 20  # times that something is left out; each takes one adjustment
@@ -149,12 +148,3 @@ def agreement(links: Sequence[LinkFit], count: int) -> np.ndarray:
         given[[fit.image1, fit.image2]] += fit.count
         kept[[fit.image1, fit.image2]] += fit.inliers
     return np.where(given > 0, kept / np.maximum(given, 1.0), 1.0)
-
-
-def scale_uncertainty(alignment: Alignment) -> list[Message]:
-    """A warning where the focal length, and with it the length of every step, is hardly known."""
-    if not alignment.length_std > Limits.max_length_std:
-        return []
-    off = f"all lengths may be off together by {alignment.length_std:.0%}"
-    text = f"{off}: the images hardly show the focal length; give --focal"
-    return [Message(text, code="focal-unknown")]

@@ -10,19 +10,19 @@ import numpy as np
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import InputError
-from rdstitch.inputs.find import FoundImages, found_images
+from rdstitch.inputs.find import FoundImages
 from rdstitch.inputs.frame import Frame, Images, as_inputs, files_of
-from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.matching.band_lens import BandLens, band_lens
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.option import declared, options_of, with_fields
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.compose import CanvasPlan, compose_images
+from rdstitch.pipeline.output_plan import OutputPlan
 from rdstitch.pipeline.replacements import read_replacements
 from rdstitch.pipeline.run import Run
-from rdstitch.pipeline.run_files import RunFiles, check_world_files, plainly_viewed, write_page
 from rdstitch.pipeline.straighten import reoriented
+from rdstitch.pipeline.viewer_pages import plainly_viewed, write_page
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages, SavedGrid
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
@@ -30,8 +30,8 @@ from rdstitch.sidecar.recomposition import Recomposition
 from rdstitch.sidecar.write_applied import applied_sidecar
 from rdstitch.stage.tile_inputs import with_position_folders
 from rdstitch.system.native_threads import one_native_thread
-from rdstitch.system.outputs import Outputs, json_bytes
-from rdstitch.system.progress import Progress, StageTimer, silent
+from rdstitch.system.outputs import json_bytes
+from rdstitch.system.progress import Progress, silent
 
 
 @one_native_thread()
@@ -89,12 +89,10 @@ def apply(
     given = as_inputs(images, options.channel_order)
     if saved.record.stage is not None:
         given = with_position_folders(given)
-    with (
-        found_images(given, outputs=[run.output], every=options.every, topic=options.topic) as listed,
-        Outputs(options.overwrite) as outputs,
-    ):
-        RunFiles.of_images(run, listed.files).check(outputs)
-        result = apply_found(saved, listed, run, options, outputs)
+    run = replace(run, inputs=given)
+    with run.found() as listed:
+        OutputPlan.of_images(run, listed.files).check()
+        result = apply_found(saved, listed, run, options)
     return replace(result, messages=(*([Message(mismatch)] if mismatch else []), *result.messages))
 
 
@@ -112,22 +110,22 @@ def apply_run(
         channel_order=options.channel_order,
         workers=options.workers,
         dry_run=options.dry_run,
+        topic=options.topic,
+        overwrite=options.overwrite,
+        strict=options.strict,
     )
-    read = [saved.path, *options.files, *settings.files]
-    return Run(settings, output, progress=StageTimer(progress), guard=InputGuard(options.strict), read=read)
+    run = Run.of((), settings, output=output, every=options.every, progress=progress)
+    return replace(run, read=[saved.path, *options.files, *settings.files])
 
 
-def apply_found(
-    saved: SavedRegistration, listed: FoundImages, run: Run, options: ApplyOptions, outputs: Outputs
-) -> Recomposition:
+def apply_found(saved: SavedRegistration, listed: FoundImages, run: Run, options: ApplyOptions) -> Recomposition:
     """Compose images that were found by a saved registration, into memory or among the outputs."""
     output = run.output
     given = read_replacements(saved, listed.frames, options, run.guard, run.options.composite.max_memory)
-    if output is not None:
-        check_world_files([output], list(given.sources.values()), options.overwrite)
+    OutputPlan.of_images(run, ()).check_places(list(given.sources.values()))
     lens, of_lens = _lens_of_band(saved, given.sources, run.progress)
     plan, run, of_turn = _laid_out(saved, given.sources, lens, run)
-    composed, of_output = compose_images(plan, run, outputs)
+    composed, of_output = compose_images(plan, run)
     sources = dict(zip(given.sources, plan.placed.sources, strict=True))
     result = Recomposition(
         saved=saved,
@@ -140,8 +138,8 @@ def apply_found(
     if options.dry_run or output is None:
         return result
     page = partial(plainly_viewed, result.canvas, [source.name for source in sources.values()])
-    result = replace(result, messages=(*result.messages, *write_page(result, outputs, page)))
-    outputs.write(f"{output}.json", json_bytes(applied_sidecar(result, same_lens=lens is None)))
+    result = replace(result, messages=(*result.messages, *write_page(result, run.outputs, page)))
+    run.outputs.write(f"{output}.json", json_bytes(applied_sidecar(result, same_lens=lens is None)))
     return result
 
 
@@ -161,11 +159,9 @@ def _laid_out(
 
 def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions) -> SavedGrid | None:
     """The pixels of the saved output, where images of the same sizes are to have the same: bands, and dates."""
-    pixels = [name for name, each in declared(CompositeOptions).items() if each.option.pixels]
-    asked = any(getattr(options, name) != getattr(saved.composite, name) for name in pixels)
     matrix, size = saved.plane_to_output, saved.record.output.size
     same_sizes = all(saved.images[index].size == source.camera.image_size for index, source in used.items())
-    alike = same_sizes and not asked and not saved.turned and options.same_turn(saved.composite)
+    alike = same_sizes and not saved.turned and options.same_canvas(saved.composite)
     return SavedGrid(matrix, size, saved.output_place) if alike and matrix is not None and size is not None else None
 
 
@@ -205,15 +201,14 @@ def _placed(saved: SavedRegistration, used: Mapping[int, Source], lens: BandLens
     to_registered = np.eye(3) if lens is None else np.linalg.inv(lens.homography)
     return PlacedImages(
         list(used.values()),
-        [source.camera for source in used.values()],
         np.array([saved.images[index].to_plane for index in used], dtype=np.float64) @ to_registered,
         list(used).index(saved.reference) if saved.reference in used else None,
         [
             None if field is None else field.resized(source.camera.image_size)
-            for field, source in ((saved.images[index].displacement_field(), source) for index, source in used.items())
+            for field, source in ((saved.images[index].displacement_field, source) for index, source in used.items())
         ],
         saved.turned,
         saved.place,
-        whole=saved.record.stage is not None,
+        tiles=saved.record.stage is not None,
         orientation=saved.orientation,
     )

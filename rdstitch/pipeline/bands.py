@@ -24,7 +24,7 @@ from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply_found, apply_run
 from rdstitch.pipeline.recipes import stitch_found
-from rdstitch.pipeline.run import started
+from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.read import read_sidecar
@@ -62,29 +62,21 @@ def mosaic_bands(
     it alone. ``field.tif`` has all bands, with their names; ``field-NIR.tif`` and so on one each. Formats that hold
     no number of bands have only the latter. Given are the first band, and the others, each by its own lens.
     """
-    options, file = options or StitchOptions(), Path(output)
+    file = Path(output)
+    files = [file.with_name(f"{file.stem}-{name}{file.suffix}") for name in bands]
+    run = Run.of(inputs, options, Purpose.MOSAIC, files[0], beside=beside, every=every, progress=progress)
+    options, outputs = run.options, run.outputs
     if options.dry_run:
         raise ArgumentError("bands have no plan before the first of them is registered: leave out dry_run")
-    files = [file.with_name(f"{file.stem}-{name}{file.suffix}") for name in bands]
     stack = [file, Path(f"{file}.json")] if file.suffix.lower() in (".tif", ".tiff") else []
-    began = started(
-        inputs,
-        options,
-        Purpose.MOSAIC,
-        files[0],
-        every=every,
-        progress=progress,
-        beside=beside,
-        also_written=[file, *files[1:]],
-    )
-    with began as (listed, run, outputs):  # all are published together
+    with run.found(file, *files[1:]) as listed:  # all are published together
         frames = selected(listed.frames, options.exclude, options.include_only)
         chosen = _by_band(frames, bands)
         _check_alike(dict(zip(bands, chosen, strict=True)), in_one_file=bool(stack))
         whole = replace(run.options, exclude=(), include_only=())
         run = replace(run, options=whole, read=[*run.read, *listed.files])
         of_first = replace(listed, frames=chosen[0])
-        first = stitch_found(of_first, run, outputs, more_images=files[1:], more_files=stack)
+        first = stitch_found(of_first, run, more_images=files[1:], more_files=stack)
         saved = replace(read_sidecar(outputs.where(f"{files[0]}.json")), path=Path(f"{files[0]}.json"))
         same = ApplyOptions(
             mask=options.mask,
@@ -93,10 +85,9 @@ def mosaic_bands(
             strict=options.strict,
             channel_order=options.channel_order,
         )
+        of_band = replace(apply_run(saved, None, saved.composite, same, progress), outputs=outputs)
         others = tuple(
-            apply_found(
-                saved, FoundImages(band, []), apply_run(saved, name, saved.composite, same, progress), same, outputs
-            )
+            apply_found(saved, FoundImages(band, []), replace(of_band, output=name), same)
             for band, name in zip(chosen[1:], files[1:], strict=True)
         )
         if stack:

@@ -13,7 +13,7 @@ from rdstitch.inputs.times import with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import stitch_found
-from rdstitch.pipeline.run import started
+from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.native_threads import one_native_thread
@@ -51,11 +51,12 @@ def mosaic_blocks(
     RdstitchError
         As by :func:`rdstitch.mosaic`, where not even one block can be stitched.
     """
-    options, file = options or StitchOptions(), Path(output)
+    file = Path(output)
     results: list[StitchResult] = []
     refused: list[Message] = []
-    began = started(inputs, options, Purpose.MOSAIC, file, every=every, progress=progress, beside=beside)
-    with began as (listed, run, outputs), ExitStack() as stack:  # all are published together, once the cache is gone
+    run = Run.of(inputs, options, Purpose.MOSAIC, file, beside=beside, every=every, progress=progress)
+    options = run.options
+    with run.found() as listed, ExitStack() as stack:  # all are published together, once the cache is gone
         # What was found of images and pairs serves the next block.
         cache = options.cache or stack.enter_context(TemporaryFolder())
         listed = replace(
@@ -69,8 +70,8 @@ def mosaic_blocks(
         while len(frames) > 1 or not results:
             run = replace(run, output=names[len(results)])
             try:
-                with outputs.together():
-                    result = stitch_found(found, run, outputs, more_images=further)
+                with run.outputs.together():
+                    result = stitch_found(found, run, more_images=further)
                 registration = result.registration
             except RdstitchError as error:
                 if not results or isinstance(error, OutputError):

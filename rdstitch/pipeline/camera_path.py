@@ -6,63 +6,64 @@ from pathlib import Path
 
 import numpy as np
 
+from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.alignment.odometry import along_odometry
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import InputError
-from rdstitch.inputs.frame import Frame, Named
-from rdstitch.inputs.odometry import Odometry, read_odometry
-from rdstitch.inputs.rosbag import is_bag, odometry_in_bag
+from rdstitch.inputs.frame import Named
+from rdstitch.inputs.odometry import Odometry
+from rdstitch.inputs.rosbag import odometry_in_bag, only_bag
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import timestamps_of
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message, shortened
 from rdstitch.results.registration import Registration
+from rdstitch.verification.limits import Limits
 
 
 def with_odometry_of_bag(inputs: Iterable[Named], options: StitchOptions) -> StitchOptions:
     """Options with the odometry of a topic, if one is named, of the bag that is the input."""
-    named, topic = [Path(item) for item in inputs if not isinstance(item, Frame)], options.odometry
+    topic = options.odometry
     if topic is None or isinstance(topic, Odometry) or Path(topic).is_file() or not str(topic).startswith("/"):
         return options
-    if len(named) != 1 or not is_bag(named[0]):
+    if (bag := only_bag(inputs)) is None:
         raise InputError(f"{topic}: no such file; a topic of odometry needs one ROS bag as input")
-    return replace(options, odometry=odometry_in_bag(named[0], str(topic)))
+    return replace(options, odometry=odometry_in_bag(bag, str(topic)))
 
 
 def camera_path(
-    registration: Registration, odometry: Odometry | str | Path | None, height: float | None
+    registration: Registration, odometry: Odometry | None, height: float | None
 ) -> tuple[Trajectory, list[Message]]:
     """The path with names, numbers and times of the images, in ``height`` of the first one or the unit of the odometry;
-    and what that has shown of it.
+    and what the user should know of it.
     """
-    sources, messages = registration.sources, list[Message]()
+    sources, messages = registration.sources, _scale_uncertainty(registration.alignment)
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     stored = QuarterTurns.of(sources).back.alignment(registration.alignment)
     path = Trajectory.from_alignment(stored, height or 1.0)
     if odometry is not None:
         length_std = registration.alignment.length_std
-        path, messages = _along_odometry(path, sources, odometry, length_std, keep_unit=height is not None)
+        path, of_odometry = _along_odometry(path, sources, odometry, length_std, keep_unit=height is not None)
+        messages += of_odometry
     numbers = [source.number(k) for k, source in enumerate(sources)]
     return path.labelled([source.name for source in sources], numbers, timestamps_of(sources)), messages
 
 
 def _along_odometry(
-    path: Trajectory, sources: Sequence[Source], given: Odometry | str | Path, length_std: float, *, keep_unit: bool
+    path: Trajectory, sources: Sequence[Source], odometry: Odometry, length_std: float, *, keep_unit: bool
 ) -> tuple[Trajectory, list[Message]]:
     """The path in the unit of the odometry, unless that is to be kept, with poses of all frames that it leads to."""
-    odometry = given if isinstance(given, Odometry) else read_odometry(given)
     times = timestamps_of(sources)
-    found = {k: body for k, time in enumerate(times.tolist()) if (body := odometry.at(time)) is not None}
-    name = "the odometry" if isinstance(given, Odometry) else str(given)
-    if not found:
+    bodies = {k: body for k, time in enumerate(times.tolist()) if (body := odometry.at(time)) is not None}
+    if not bodies:
         first, last = odometry.times[[0, -1]].tolist()
         seen = times[np.isfinite(times)]
         of = f"those of the images are from {seen.min():.3f} to {seen.max():.3f} s" if len(seen) else "images have none"
-        raise InputError(f"{name}: has times from {first:.3f} to {last:.3f} s, {of}; give --timestamps")
-    along = along_odometry(path, found, length_std, keep_unit=keep_unit)
+        raise InputError(f"{odometry.name}: has times from {first:.3f} to {last:.3f} s, {of}; give --timestamps")
+    along = along_odometry(path, bodies, length_std, keep_unit=keep_unit)
     if along is None:
-        return path, [Message(f"{name}: shows no motion of the images that have a pose; it is not used")]
+        return path, [Message(f"{odometry.name}: shows no motion of the images that have a pose; it is not used")]
     (whole, fit), messages = along, list[Message]()
     if not keep_unit:
         text = f"lengths are those of the odometry, ± {fit.length_std:.1%}: the camera is at {whole.height[0]:.4g}"
@@ -71,3 +72,12 @@ def _along_odometry(
     if added := [sources[k].name for k in whole.frame.tolist() if k not in seen_frames]:
         messages.append(Message(f"placed by the odometry alone: {shortened(added)}", severity="note"))
     return whole, messages
+
+
+def _scale_uncertainty(alignment: Alignment) -> list[Message]:
+    """A warning where the focal length, and with it the length of every step, is hardly known."""
+    if not alignment.length_std > Limits.max_length_std:
+        return []
+    off = f"all lengths may be off together by {alignment.length_std:.0%}"
+    text = f"{off}: the images hardly show the focal length; give --focal"
+    return [Message(text, code="focal-unknown")]

@@ -90,54 +90,54 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
     trials = _Trials(options, aligner.options.purpose is Purpose.PANO, edges_of)
     if options.dry_run:
         return trials.lay_out(registration)
-    first: CandidateLayout | LimitError
+    first, too_large = None, None
     try:
         first = trials.lay_out(registration)
     except LimitError as error:
-        first = error
-    if isinstance(first, LimitError) or first.seams.contradicted:
+        too_large = error
+    if first is None or first.seams.contradicted:
         registration, first = _plane_behind(registration, first, trials, aligner)
-    tried = [first] if isinstance(first, CandidateLayout) else []
-    for other in _alternatives(registration, tried, trials, aligner):
+    tried = [] if first is None else [first]
+    for other in _alternatives(registration, first, trials, aligner):
         tried.append(other)
         # Of those that nothing speaks against, the most probable is taken.
         if other.clipped <= tried[0].clipped and not other.faults:
             break
-    if isinstance(first, LimitError) and not tried:
-        raise first
-    best = _least_broken(tried, first)
+    if too_large is not None and not tried:
+        raise too_large
+    best = _least_broken(tried, keep_first=first is not None)
     if best.seams.by_chance and not options.force:
         raise RefusedError(best.registration.with_messages([_BY_CHANCE]))
     return best
 
 
 def _plane_behind(
-    registration: Registration, first: CandidateLayout | LimitError, trials: _Trials, aligner: Aligner
-) -> tuple[Registration, CandidateLayout | LimitError]:
+    registration: Registration, first: CandidateLayout | None, trials: _Trials, aligner: Aligner
+) -> tuple[Registration, CandidateLayout | None]:
     """The plane behind what moves of its own, with its layout, where its images look more alike; else what is given."""
     plane = plane_of_most(registration, aligner, trials.options.threads)
     if plane is None or not _joins(plane, registration, aligner.threshold):
         return registration, first
     behind = trials.attempt(plane)
     # What is put where it does not belong is unlike all over what the images show.
-    if behind is None or (isinstance(first, CandidateLayout) and behind.seams.fills <= first.seams.fills):
+    if behind is None or (first is not None and behind.seams.fills <= first.seams.fills):
         return registration, first
     return plane, behind
 
 
 def _alternatives(
-    registration: Registration, tried: Sequence[CandidateLayout], trials: _Trials, aligner: Aligner
+    registration: Registration, first: CandidateLayout | None, trials: _Trials, aligner: Aligner
 ) -> Iterator[CandidateLayout]:
     """Other layouts, the likeliest first, where something speaks against the first one, or it has no canvas."""
-    first = tried[0] if tried else None
-    if first is not None and not first.faults:
-        return
-    if first is not None and first.local.fields and trials.options.local_alignment == "auto":
-        yield trials.lay_out(registration, no_local_alignment("seams hold better without it"))
-    if first is not None and first.local.by_heights:
-        return  # parallax that the places of the cameras explain is not that of another model
-    if first is not None and (other_surface := _other_surface(registration, first, trials, aligner)) is not None:
-        yield other_surface
+    if first is not None:
+        if not first.faults:
+            return
+        if first.local.fields and trials.options.local_alignment == "auto":
+            yield trials.lay_out(registration, no_local_alignment("seams hold better without it"))
+        if first.local.by_heights:
+            return  # parallax that the places of the cameras explain is not that of another model
+        if (other_surface := _other_surface(registration, first, trials, aligner)) is not None:
+            yield other_surface
     for other in _other_models(registration, first, trials.options, aligner):
         if (laid_out := trials.attempt(other)) is not None:
             yield laid_out
@@ -159,13 +159,13 @@ def _other_surface(
     return laid_out
 
 
-def _least_broken(tried: Sequence[CandidateLayout], given: CandidateLayout | LimitError) -> CandidateLayout:
-    """The layout that the least speaks against; the one that was given unless another is clearly better."""
+def _least_broken(tried: Sequence[CandidateLayout], *, keep_first: bool) -> CandidateLayout:
+    """The layout that the least speaks against; or else the first, unless another is clearly better."""
     first = tried[0]
     best = min((one for one in tried if one.clipped <= first.clipped), key=lambda one: (one.faults, one.broken))
     broken = 0 if first.seams.fit else first.broken
     clearly = best.faults < first.faults or best.broken <= _CLEARLY * broken
-    return best if clearly or isinstance(given, LimitError) else first
+    return best if clearly or not keep_first else first
 
 
 def _other_models(

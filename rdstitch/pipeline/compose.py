@@ -77,7 +77,7 @@ class CanvasPlan:
 
 
 def compose_images(
-    plan: CanvasPlan, run: Run, outputs: Outputs, run_blocks: BlockRunner | None = None
+    plan: CanvasPlan, run: Run, run_blocks: BlockRunner | None = None
 ) -> tuple[OutputImage, list[Message]]:
     """Put images on a canvas, in memory or into a file that can hold it, of a dry run plan it; and what to know of it.
 
@@ -85,7 +85,7 @@ def compose_images(
     :func:`rdstitch.compositing.compose_decided`.
     """
     return_freed_memory()
-    options = run.options.compositing
+    options, outputs = run.options.compositing, run.outputs
     placed, canvas, place, output = plan.placed, plan.canvas, plan.georeference, run.output
     messages = [
         *masked_messages(placed),

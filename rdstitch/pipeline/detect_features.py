@@ -47,37 +47,33 @@ def _detect_all(
     sources: Sequence[Source], options: FeatureOptions, run: Run, executor: Executor, store: Cache
 ) -> DetectedFeatures:
     """Detect the features of every image, several images at a time, into ``store``."""
-    results: list[StoredFeatures | InputError] = []
+    features: list[StoredFeatures] = []
+    damaged: dict[int, str] = {}
     of_batch = partial(detect_batch, options=options, store=store)
     tasks = ((of_batch, batch) for batch in batches(sources, _IMAGES_AT_ONCE, _MIN_BATCHES))
     for batch in run_on_sources(executor, tasks, run.guard):
-        errors = [result for result in batch if isinstance(result, InputError)]
-        if errors and run.purpose is Purpose.PANO:
-            raise errors[0]
-        for result in batch:
-            if isinstance(result, InputError):
-                run.guard.unreadable[sources[len(results)].path] = str(result)
-            results.append(result)
-        run.progress("detecting features", len(results), len(sources))
-    damaged = {index: str(result) for index, result in enumerate(results) if isinstance(result, InputError)}
-    features = (
-        StoredFeatures.of(_no_features(options, source)) if isinstance(result, InputError) else result
-        for source, result in zip(sources, results, strict=True)
-    )
+        for detected, problem in batch:
+            index, source = len(features), sources[len(features)]
+            if problem:
+                if run.purpose is Purpose.PANO:
+                    raise InputError(problem)
+                run.guard.unreadable[source.path] = damaged[index] = problem
+            features.append(StoredFeatures.of(_no_features(options, source)) if detected is None else detected)
+        run.progress("detecting features", len(features), len(sources))
     return DetectedFeatures(FeatureStore(tuple(features)), damaged, options.stretch)
 
 
 def detect_batch(
     sources: Sequence[Source], *, options: FeatureOptions, store: Cache
-) -> list[StoredFeatures | InputError]:
-    """The features of each image, or why it cannot be read."""
+) -> list[tuple[StoredFeatures | None, str]]:
+    """The features of each image, or None and why it cannot be read."""
     reuse_freed_memory()  # also in a worker, whose later tasks return it
-    detected: list[StoredFeatures | InputError] = []
+    detected: list[tuple[StoredFeatures | None, str]] = []
     for source in sources:
         try:
-            detected.append(_detected(source, options, store))
+            detected.append((_detected(source, options, store), ""))
         except InputError as error:
-            detected.append(error)
+            detected.append((None, str(error)))
     return detected
 
 

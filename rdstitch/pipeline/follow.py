@@ -23,7 +23,7 @@ from rdstitch.inputs.delays import MeasuredTilt
 from rdstitch.inputs.frame import Frame, Image, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.masks import with_masks
-from rdstitch.inputs.odometry import BodyPose, Odometry, read_odometry
+from rdstitch.inputs.odometry import BodyPose, Odometry, as_odometry
 from rdstitch.inputs.selection import is_selected
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import time_of, timestamps_of
@@ -224,8 +224,7 @@ class Tracker:
         label = replace(label, name=source.name, timestamp=float(timestamps_of([source])[0]))
         camera = at_working_size(source.camera, self._megapixels)
         attitude = None if source.attitude is None else source.attitude.at_delays
-        if body is None and (given := self._options.odometry) is not None:
-            odometry = given if isinstance(given, Odometry) else read_odometry(given)
+        if body is None and (odometry := as_odometry(self._options.odometry)) is not None:
             body = odometry.at(label.timestamp)
         results = self._frames.add(image, camera, attitude, body)
         self._labels[results[-1].number] = label

@@ -9,8 +9,8 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import inverse, turned_size
 from rdstitch.inputs.find import find_images
-from rdstitch.inputs.frame import Frame, Named
-from rdstitch.inputs.rosbag import camera_in, camera_in_bag, is_bag
+from rdstitch.inputs.frame import Named
+from rdstitch.inputs.rosbag import camera_in, camera_in_bag, is_bag, only_bag
 from rdstitch.io.metadata import read_metadata
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message
@@ -50,11 +50,10 @@ def with_camera(
     if isinstance(options.camera, str | Path):
         camera, messages = read_camera(options.camera, inputs)
         return replace(options, camera=camera), messages
-    named = [Path(item) for item in inputs if not isinstance(item, Frame)]
-    if not of_bag or options.known_distortion is not None or len(named) != 1 or not is_bag(named[0]):
+    bag = only_bag(inputs) if of_bag and options.known_distortion is None else None
+    if bag is None or (calibration := camera_in_bag(bag, options.topic)) is None:
         return options, []
-    if (found := camera_in_bag(named[0], options.topic)) is None:
-        return options, []
-    text = f"the calibration in the bag, {found[1]}, is used; --camera FILE takes another one"
-    note = Message(text, (str(named[0]),), "note")
-    return replace(options, camera=found[0].camera, lens="auto", solver="auto"), [note]
+    file, topic = calibration
+    text = f"the calibration in the bag, {topic}, is used; --camera FILE takes another one"
+    note = Message(text, (str(bag),), "note")
+    return replace(options, camera=file.camera, lens="auto", solver="auto"), [note]

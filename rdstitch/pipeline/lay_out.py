@@ -13,7 +13,7 @@ from rdstitch.compositing.projection import PLANE
 from rdstitch.compositing.seam_quality import SeamQuality
 from rdstitch.features.line_segments import MEGAPIXELS, line_segments
 from rdstitch.inputs.source import Source
-from rdstitch.local_alignment import LocalAlignment, Match, align_locally, no_local_alignment
+from rdstitch.local_alignment import LocalAlignment, PutativeMatches, align_locally, no_local_alignment
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.pipeline.compose import CanvasPlan
@@ -83,9 +83,9 @@ def align_registration_locally(
     position = np.cumsum(alignment.used) - 1
     pairs = [pair for pair in registration.used_pairs if pair.relation]
 
-    def match(pair: PairRegistration) -> Match:
+    def match(pair: PairRegistration) -> PutativeMatches:
         found = pair.correspondences
-        return Match(int(position[pair.image1]), int(position[pair.image2]), found.points1, found.points2)
+        return PutativeMatches(int(position[pair.image1]), int(position[pair.image2]), found.points1, found.points2)
 
     def edges_of(images: list[int]) -> list[FloatArray]:
         with ThreadPoolExecutor(threads) as pool:

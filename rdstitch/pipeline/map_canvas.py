@@ -42,7 +42,7 @@ def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
         return canvas
     # The canvas has whole pixels around the images, and a full turn a multiple of some: these may be too many.
     spare = 1 if canvas.period is None else max(32, options.max_size // 128)
-    return _plan(placed, options, options.scale * (options.max_size - spare) / max(canvas.size))
+    return _plan(placed, options, options.scale * max(options.max_size - spare, 1) / max(canvas.size))
 
 
 def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canvas:
@@ -80,7 +80,8 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
             if epsg is not None:
                 place = place.in_system(Crs(epsg), np.concatenate(canvas.footprints))
         else:
-            place, reason = place_on_map(placed.located(canvas), epsg, force=options.georeference == "force")
+            force, to_output = options.georeference == "force", canvas.matrix @ placed.homographies
+            place, reason = place_on_map(placed.sources, to_output, placed.errors, epsg, force=force)
     if place is None:
         for name in ("gsd", "like", "extent"):
             if getattr(options, name) is not None:

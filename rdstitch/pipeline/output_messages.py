@@ -50,10 +50,11 @@ def place_messages(place: Georeference | None, reason: str, placed: PlacedImages
     if place.checks:
         messages.append(Message(check_summary(place), severity="note"))
     if place.rejected:
-        names = [name for name, _ in place.rejected]
+        names = [residual.name for residual in place.rejected]
         more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-        off = max(away for _, away in place.rejected)
-        text = f"{place.source} that the images contradict, by up to {off:.3g} m, were not used: "
+        off = max(residual.distance for residual in place.rejected)
+        contradicted = f"the images contradict, by up to {off:.3g} m," if off else "have no place in the output"
+        text = f"{place.source} that {contradicted} were not used: "
         messages.append(Message(f"{text}{', '.join(names[:MAX_NAMED])}{more}"))
     return messages
 

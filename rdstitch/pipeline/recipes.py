@@ -9,44 +9,39 @@ from pathlib import Path
 
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
-from rdstitch.errors import ArgumentError, RegistrationError
+from rdstitch.errors import RegistrationError
 from rdstitch.export.trajectory_files import has_times, path_as_svg
 from rdstitch.export.write_trajectory import write_trajectory
 from rdstitch.inputs.find import FoundImages
 from rdstitch.inputs.frame import Images, frame_numbers
 from rdstitch.inputs.input_guard import InputGuard
+from rdstitch.inputs.odometry import as_odometry
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import with_times
-from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside, ReportFile
 from rdstitch.options.option import check_parameter, options_of
 from rdstitch.options.shared_options import Height
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.accept import accept, scale_uncertainty
+from rdstitch.pipeline.accept import accept
 from rdstitch.pipeline.camera_path import camera_path
 from rdstitch.pipeline.choose_layout import choose_layout
 from rdstitch.pipeline.compose import compose_images
 from rdstitch.pipeline.lay_out import CandidateLayout
 from rdstitch.pipeline.map_canvas import check_map
+from rdstitch.pipeline.output_plan import OutputPlan, report_refused, stage_report
 from rdstitch.pipeline.read_inputs import in_order, read_inputs
 from rdstitch.pipeline.realign import aligner_of, with_reference_of
 from rdstitch.pipeline.register import register
-from rdstitch.pipeline.run import Run, started
-from rdstitch.pipeline.run_files import (
-    RunFiles,
-    check_world_files,
-    report_refused,
-    stage_beside,
-    viewed_images,
-    write_page,
-)
+from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.run_on_sources import blocks_on
+from rdstitch.pipeline.viewer_pages import viewed_images, write_page
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.native_threads import one_native_thread
-from rdstitch.system.outputs import Outputs, json_bytes, text_bytes
+from rdstitch.system.outputs import json_bytes, text_bytes
 from rdstitch.system.progress import Progress, silent
 from rdstitch.verification.verdict import RefusedError
 
@@ -99,9 +94,9 @@ def pano(
     >>> result.image.shape[2], result.ok
     (3, True)
     """
-    began = started(inputs, options, Purpose.PANO, output, every=every, progress=progress, beside=beside)
-    with began as (listed, run, outputs):
-        return stitch_found(listed, run, outputs)
+    run = Run.of(inputs, options, Purpose.PANO, output, beside=beside, every=every, progress=progress)
+    with run.found() as images:
+        return stitch_found(images, run)
 
 
 @one_native_thread()
@@ -145,38 +140,33 @@ def mosaic(
     >>> result.output.name, result.registration.alignment.used.all()
     ('small.tif', np.True_)
     """
-    began = started(inputs, options, Purpose.MOSAIC, output, every=every, progress=progress, beside=beside)
-    with began as (listed, run, outputs):
-        return stitch_found(listed, run, outputs)
+    run = Run.of(inputs, options, Purpose.MOSAIC, output, beside=beside, every=every, progress=progress)
+    with run.found() as images:
+        return stitch_found(images, run)
 
 
 def stitch_found(
-    listed: FoundImages,
-    run: Run,
-    outputs: Outputs,
-    *,
-    more_images: Sequence[Path] = (),
-    more_files: Sequence[Path] = (),
+    images: FoundImages, run: Run, *, more_images: Sequence[Path] = (), more_files: Sequence[Path] = ()
 ) -> StitchResult:
     """Stitch images that were found into an output of a run; more images, and files, may be written after it."""
     options = run.options
-    frames = in_order(with_times(listed.frames, options.timestamps))
+    frames = in_order(with_times(images.frames, options.timestamps))
     names = [frame.name for frame in selected(frames, options.exclude, options.include_only)]
-    files = RunFiles.of_images(run, listed.files, names, more_images, more_files)
-    files.check(outputs)
-    run = replace(run, guard=InputGuard(options.strict), layers=files.layers)
+    plan = OutputPlan.of_images(run, images.files, names, more_images, more_files)
+    plan.check()
+    run = replace(run, guard=InputGuard(options.strict))
     sources, unread = read_inputs(frames, options, run.guard, skip_bad=run.purpose is not Purpose.PANO)
-    check_world_files([*([] if run.output is None else [run.output]), *more_images], sources, options.overwrite)
+    plan.check_places(sources)
     check_map(sources, options.composite)
     if run.beside.frame == "first":
         run = replace(run, options=replace(options, reference=sources[0].name))
-    known = [*unread, *listed.messages, *run.notes]
+    known = [*unread, *images.messages, *run.notes]
     with run.executor(len(sources)) as executor:
         with _failures_explained(run, known):
             accepted, run = _accepted(sources, known, run, executor)
             run.progress("laying out", 0, 1)
             chosen = choose_layout(accepted, run.options, aligner_of(accepted, run.options, run.purpose))
-        return compose_registration(chosen, run, outputs, executor)
+        return compose_registration(chosen, run, plan, executor)
 
 
 @one_native_thread()
@@ -186,7 +176,7 @@ def calibrate(
     *,
     every: int | None = None,
     progress: Progress = silent,
-    beside: FilesBeside = NOTHING_BESIDE,
+    beside: ReportFile = NOTHING_BESIDE,
 ) -> Registration:
     """Find the lens from images of a plane; the camera is ``result.camera``.
 
@@ -207,14 +197,13 @@ def calibrate(
     RdstitchError
         See the tree in :mod:`rdstitch.errors`.
     """
-    if replace(beside, report=None, command="") != NOTHING_BESIDE:
-        raise ArgumentError("calibrate composites nothing: beside it there is a report only")
-    began = started(inputs, options, Purpose.CALIBRATE, every=every, progress=progress, beside=beside)
-    with began as (listed, run, outputs):
-        RunFiles.of_images(run, listed.files).check(outputs)
-        result = _registered(listed, run)
-        _save_camera(result, run.options, outputs)
-        return result.with_messages(stage_beside(run, outputs, result))
+    files = FilesBeside.of(ReportFile, beside, "calibrate")
+    run = Run.of(inputs, options, Purpose.CALIBRATE, beside=files, every=every, progress=progress)
+    with run.found() as images:
+        OutputPlan.of_images(run, images.files).check()
+        result = _registered(images, run)
+        _save_camera(result, run)
+        return result.with_messages(stage_report(run, result))
 
 
 @one_native_thread()
@@ -258,29 +247,30 @@ def trajectory(
         check_parameter(name, kind, value)
     check_parameter("frame", TrajectoryFrame | None, frame)
     options = replace(options_of(StitchOptions, options), pose_covariance=True)
-    began = started(inputs, options, Purpose.TRAJECTORY, every=every, progress=progress)
-    with began as (listed, run, outputs):
-        RunFiles.of_path(run, listed.files, output, plot, layout).check(outputs)
-        numbers = frame_numbers(listed.frames)
-        numbered = [replace(frame, number=k) for frame, k in zip(listed.frames, numbers, strict=True)]
-        registration = _registered(replace(listed, frames=numbered), run)
-        path, of_path = camera_path(registration, run.options.odometry, height)
-        messages = [*scale_uncertainty(registration.alignment), *of_path]
+    run = Run.of(inputs, options, Purpose.TRAJECTORY, every=every, progress=progress)
+    with run.found() as images:
+        OutputPlan.of_path(run, images.files, output, plot, layout).check()
+        odometry = as_odometry(run.options.odometry)
+        numbers = frame_numbers(images.frames)
+        numbered = [replace(frame, number=k) for frame, k in zip(images.frames, numbers, strict=True)]
+        registration = _registered(replace(images, frames=numbered), run)
+        path, messages = camera_path(registration, odometry, height)
         if layout in ("tum", "bag") and not has_times(path):
             messages.append(_NO_TIMES)
         if output is not None:
-            write_trajectory(path, Path(output), layout, frame, outputs)
+            write_trajectory(path, Path(output), layout, frame, run.outputs)
+        _save_camera(registration, run)
         if plot is not None:
             drawn = text_bytes(path_as_svg(path, "heights" if height is None else "m"))
-            messages += outputs.attempt(plot, partial(outputs.write, plot, drawn))
+            messages += run.outputs.attempt(plot, partial(run.outputs.write, plot, drawn))
         return path, registration.with_messages(messages)
 
 
-def _registered(listed: FoundImages, run: Run) -> Registration:
+def _registered(images: FoundImages, run: Run) -> Registration:
     """The registration of images that were found, in pixels of their full size."""
-    frames = with_times(listed.frames, run.options.timestamps)
+    frames = with_times(images.frames, run.options.timestamps)
     sources, unread = read_inputs(frames, run.options, run.guard, skip_bad=True)
-    known = [*unread, *listed.messages, *run.notes]
+    known = [*unread, *images.messages, *run.notes]
     with run.executor(len(sources)) as executor, _failures_explained(run, known):
         accepted, _ = _accepted(sources, known, run, executor)
     return _finished(at_full_size(accepted), run)
@@ -318,11 +308,11 @@ def _accepted(
     return accepted, run
 
 
-def compose_registration(chosen: CandidateLayout, run: Run, outputs: Outputs, executor: Executor) -> StitchResult:
+def compose_registration(chosen: CandidateLayout, run: Run, plan: OutputPlan, executor: Executor) -> StitchResult:
     """Compose images at the places of a registration, into memory or among the outputs, with all that belongs to it."""
-    registration, options = chosen.registration, run.options
+    registration, options, outputs = chosen.registration, run.options, run.outputs
     run_blocks = blocks_on(executor, chosen.plan.placed.sources, run.guard, options.cache)
-    composed, messages = compose_images(chosen.plan, run, outputs, run_blocks)
+    composed, messages = compose_images(chosen.plan, run, run_blocks)
     result = StitchResult(
         registration=_finished(registration, run).with_messages((*chosen.messages, *messages)),
         local_alignment=chosen.local,
@@ -330,10 +320,10 @@ def compose_registration(chosen: CandidateLayout, run: Run, outputs: Outputs, ex
     )
     if options.dry_run:
         return result
-    failed = outputs.attempt(options.save_camera or "", partial(_save_camera, registration, options, outputs))
+    failed = outputs.attempt(options.save_camera or "", partial(_save_camera, registration, run))
     failed += write_page(result, outputs, partial(viewed_images, result))
     result = result.with_messages(failed)
-    result = result.with_messages(stage_beside(run, outputs, result))
+    result = result.with_messages(plan.stage(result))
     if run.output is not None:
         # Last: whoever finds it finds what it belongs to.
         from rdstitch.sidecar.write import sidecar  # and with it the forms of camera files, which no picture needs
@@ -349,9 +339,10 @@ def _finished(registration: Registration, run: Run) -> Registration:
     return registration.with_messages(run.guard.messages)
 
 
-def _save_camera(registration: Registration, options: StitchOptions, outputs: Outputs) -> None:
+def _save_camera(registration: Registration, run: Run) -> None:
+    options = run.options
     if options.save_camera is not None:
         from rdstitch.camera_files import camera_file_text
 
         text = camera_file_text(registration.camera, options.save_camera, options.camera_format)
-        outputs.write(options.save_camera, text_bytes(text))
+        run.outputs.write(options.save_camera, text_bytes(text))

@@ -1,9 +1,10 @@
 """The registration that pano, mosaic, calibrate and trajectory share: features, pairs, one alignment."""
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from importlib import import_module
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
@@ -17,9 +18,10 @@ from rdstitch.matching.pair_estimator import FeatureMatching, PairEstimator
 from rdstitch.matching.repeated_pattern import match_repeated_patterns
 from rdstitch.matching.static_background import without_static_background
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.aligner import Aligner, draft_with_loops, impossible_estimates_fail
+from rdstitch.pipeline.aligner import Aligner, impossible_estimates_fail
 from rdstitch.pipeline.detect_features import detect_by_contrast
 from rdstitch.pipeline.image_circle import with_image_circle
+from rdstitch.pipeline.redraft import draft_with_loops
 from rdstitch.pipeline.repeated_patterns import match_crossings, settle_repeated_pattern
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.working_size import at_working_size
@@ -48,7 +50,9 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
         sources = with_image_circle(sources, executor, cache, run.guard, options.features.limits[1])
     aligner = Aligner.of(sources, options, cache, purpose)
     store = cache if options.cache is not None else Cache.for_this_run()
-    detected = detect_by_contrast(sources, options.features, run, executor, store)
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(import_module, "scipy.sparse.csgraph")  # 0.15 s, which alignments would wait for
+        detected = detect_by_contrast(sources, options.features, run, executor, store)
     cameras = [at_working_size(source.camera, options.features.limits[1]) for source in sources]
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
     candidates = first_pairs(features, options.seed, positions_of(sources))

@@ -1,6 +1,6 @@
 """Which of the given images take the places of registered ones: read, corrected, and with the cameras found then."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from rdstitch.errors import InputError, PartialResultError
@@ -10,7 +10,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.options.apply_options import ApplyOptions
-from rdstitch.pipeline.read_inputs import check_one_size, with_flat_field
+from rdstitch.pipeline.flat_field import check_one_size, with_flat_field
 from rdstitch.results.messages import Message, left_out, merge_by_reason
 from rdstitch.sidecar.counterparts import counterparts
 from rdstitch.sidecar.read import SavedRegistration
@@ -37,9 +37,7 @@ def read_replacements(
     if stage is not None:
         frames, _, messages = tile_frames(frames, stage.z, stage.time)
     chosen, matched, unmatched = counterparts(saved, frames, options.match)
-    read = dict(_read(saved, chosen, guard, max_memory))
-    missing = {index: one for index, one in read.items() if isinstance(one, Message)}
-    sources = {index: one for index, one in read.items() if isinstance(one, Source)}
+    sources, missing = _read(saved, chosen, guard, max_memory)
     if options.strict and missing:
         raise PartialResultError("; ".join(map(str, merge_by_reason(missing.values()))))
     if not sources:
@@ -62,16 +60,22 @@ def read_replacements(
 
 def _read(
     saved: SavedRegistration, chosen: Sequence[Frame | None], guard: InputGuard, max_memory: int | None
-) -> Iterator[tuple[int, Source | Message]]:
+) -> tuple[dict[int, Source], dict[int, Message]]:
     """For each image that was used then the one in its place, with its camera, or why there is none."""
+    sources: dict[int, Source] = {}
+    missing: dict[int, Message] = {}
     for index, (image, frame) in enumerate(zip(saved.images, chosen, strict=True)):
         if image.camera is None or image.to_plane is None:
             continue
         if frame is None:
-            yield index, left_out(saved.original(image) or image.path, "is not among the given images")
+            missing[index] = left_out(saved.original(image) or image.path, "is not among the given images")
             continue
         read, unread = read_sources([frame], skip_bad=True, guard=guard, max_memory=max_memory)
-        yield index, unread[0] if unread else replace(read[0], camera=_resized(image.camera, read[0]))
+        if unread:
+            missing[index] = unread[0]
+        else:
+            sources[index] = replace(read[0], camera=_resized(image.camera, read[0]))
+    return sources, missing
 
 
 def _resized(camera: Camera, source: Source) -> Camera:

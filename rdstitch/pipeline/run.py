@@ -1,12 +1,14 @@
 """What all stages of one run have in common."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Self
 
+from rdstitch.alignment.motion_models import MODELS
 from rdstitch.choices import Purpose
 from rdstitch.errors import ArgumentError
 from rdstitch.executors import open_executor
@@ -26,65 +28,63 @@ from rdstitch.system.progress import Progress, StageTimer, silent
 
 @dataclass(frozen=True)
 class Run:
-    """What the user decided, what is read and written, and what is noticed meanwhile."""
+    """What the user decided, what is read, where results and progress go, and what is noticed meanwhile."""
 
     options: StitchOptions
     output: Path | None = None  # image to write; None for one in memory
     beside: FilesBeside = NOTHING_BESIDE
-    progress: StageTimer = field(default_factory=StageTimer)  # it knows how long each stage took, for the report
     purpose: Purpose = Purpose.MOSAIC
-    guard: InputGuard = field(default_factory=InputGuard)  # what all who read the input files notice of them
+    inputs: Sequence[Named] = ()
+    every: int | None = None
     read: Sequence[Path] = ()  # files that are read besides the images
     notes: Sequence[Message] = ()  # on what is given besides the images
-    layers: Mapping[str, tuple[Path, Path]] = field(default_factory=dict)  # files of each image's layer and mask
+    progress: StageTimer = field(default_factory=StageTimer)  # it knows how long each stage took, for the report
+    guard: InputGuard = field(default_factory=InputGuard)  # what all who read the input files notice of them
+    outputs: Outputs = field(default_factory=partial(Outputs, overwrite=False))  # what is staged
 
     @classmethod
     def of(
         cls,
-        inputs: Sequence[Named],
+        inputs: Images,
         options: StitchOptions | None,
-        output: str | Path | None = None,
-        beside: FilesBeside = NOTHING_BESIDE,
-        progress: Progress = silent,
         purpose: Purpose = Purpose.MOSAIC,
+        output: str | Path | None = None,
+        *,
+        beside: FilesBeside = NOTHING_BESIDE,
+        every: int | None = None,
+        progress: Progress = silent,
     ) -> Self:
         """Begin a run over inputs; the camera, and the odometry of a path, are read that options name, or a bag has."""
-        options = options or StitchOptions()
+        options, beside = options_of(StitchOptions, options), options_of(FilesBeside, beside, "beside")
+        check_parameter("every", Every, every)
+        given, file = as_inputs(inputs, options.channel_order), None if output is None else Path(output)
+        if options.dry_run and not purpose.picture:
+            raise ArgumentError(f"{purpose} composites nothing: leave out dry_run")
         if beside.frame == "first" and options.reference is not None:
             raise ArgumentError("reference and frame first both name the reference; leave one of them out")
         if beside.poses is not None:
             options = replace(options, pose_covariance=True)
-        if purpose is Purpose.TRAJECTORY:
-            options = with_odometry_of_bag(inputs, options)
-        known, notes = with_camera(options, inputs, of_bag=purpose is not Purpose.CALIBRATE)
-        file, timer, guard = None if output is None else Path(output), StageTimer(progress), InputGuard(options.strict)
-        return cls(known, file, beside, timer, purpose, guard, options.files, notes)
+        if purpose.poses:
+            if options.model != "auto" and not MODELS[options.model].has_metric_poses:
+                raise ArgumentError(f"a {options.model} model has no path; choose another one, such as tilting")
+            options = with_odometry_of_bag(given, options)
+        known, notes = with_camera(options, given, of_bag=purpose is not Purpose.CALIBRATE)
+        guard, outputs = InputGuard(options.strict), Outputs(options.overwrite)
+        return cls(
+            known, file, beside, purpose, given, every, options.files, notes, StageTimer(progress), guard, outputs
+        )
+
+    @contextmanager
+    def found(self, *also_written: Path) -> Iterator[FoundImages]:
+        """The images, none of which is among the outputs; in the end all that was staged is published."""
+        written = [self.output, *also_written]
+        with (
+            found_images(self.inputs, outputs=written, every=self.every, topic=self.options.topic) as images,
+            self.outputs,
+        ):
+            yield images
 
     def executor(self, images: int) -> Executor:
         """Where the tasks of so many images are computed; to be used in a ``with`` block."""
         options = self.options
         return open_executor(options.threads, images, scheduler=options.scheduler, store=options.cache)
-
-
-@contextmanager
-def started(
-    inputs: Images,
-    options: StitchOptions | None,
-    purpose: Purpose,
-    output: str | Path | None = None,
-    *,
-    every: int | None,
-    progress: Progress,
-    beside: FilesBeside = NOTHING_BESIDE,
-    also_written: Sequence[Path] = (),
-) -> Iterator[tuple[FoundImages, Run, Outputs]]:
-    """Find images, none of which is among the outputs, and begin a run over them; files are published in the end."""
-    options, beside = options_of(StitchOptions, options), options_of(FilesBeside, beside, "beside")
-    check_parameter("every", Every, every)
-    given = as_inputs(inputs, options.channel_order)
-    run = Run.of(given, options, output, beside, progress, purpose)
-    with (
-        found_images(given, outputs=[run.output, *also_written], every=every, topic=options.topic) as listed,
-        Outputs(options.overwrite) as outputs,
-    ):
-        yield listed, run, outputs

@@ -14,21 +14,21 @@ from numpy.typing import NDArray
 from rdstitch.arrays import evenly_spaced
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.export.places_files import fiji_list, places_table
-from rdstitch.inputs.find import FoundImages, found_images
+from rdstitch.inputs.find import FoundImages
 from rdstitch.inputs.frame import Frame, Images, frame_numbers
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.io.stored_tiles import StoredTile
 from rdstitch.local_alignment import no_local_alignment
-from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
+from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside, ImageFiles
 from rdstitch.options.option import options_of, with_fields
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.options.tile_options import TileOptions
+from rdstitch.pipeline.flat_field import NO_FLAT_FIELD, with_flat_field
 from rdstitch.pipeline.lay_out import lay_out
-from rdstitch.pipeline.read_inputs import NO_FLAT_FIELD, with_flat_field
+from rdstitch.pipeline.output_plan import OutputPlan
 from rdstitch.pipeline.recipes import compose_registration
 from rdstitch.pipeline.run import Run
-from rdstitch.pipeline.run_files import RunFiles, check_world_files
 from rdstitch.pipeline.tiles_as_registration import tiles_as_registration
 from rdstitch.results.messages import Message, left_out
 from rdstitch.results.registration import Registration
@@ -56,7 +56,7 @@ def tiles(
     *,
     positions_file: str | Path | None = None,
     progress: Progress = silent,
-    beside: FilesBeside = NOTHING_BESIDE,
+    beside: ImageFiles = NOTHING_BESIDE,
     **fields: Any,
 ) -> StitchResult:
     """Stitch tiles taken on a stage, whose places are roughly known.
@@ -71,8 +71,10 @@ def tiles(
     options : TileOptions, optional
     positions_file : path, optional
         CSV file to write the places to as well; Fiji's list of tiles where its name ends in ``.txt``.
-    progress, beside
+    progress
         As for :func:`rdstitch.mosaic`.
+    beside : FilesBeside
+        What else is written: report, layers, a project of Hugin.
     **fields
         Fields of the options, instead of those in ``options``: ``tiles(arrays, positions=places, pixel_size=0.65)``.
 
@@ -82,19 +84,22 @@ def tiles(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = with_fields(options_of(TileOptions, options), fields)
-    run = _tile_run(options, output, beside, progress)
-    with (
-        found_images(as_tiles(inputs), outputs=[run.output], topic=options.topic) as listed,
-        Outputs(options.overwrite) as outputs,
-    ):
-        registration = _registered(listed, run, options, positions_file, outputs)
+    files = FilesBeside.of(ImageFiles, beside, "tiles")
+    run = replace(_tile_run(options, progress, output, files), inputs=as_tiles(inputs))
+    with run.found() as listed:
+        registration, plan = _registered(listed, run, options, positions_file)
         with run.executor(len(registration.sources)) as executor:
             chosen = lay_out(registration, no_local_alignment("tiles on a stage"), options.composite)
             chosen = replace(chosen, plan=replace(chosen.plan, photographs=False))
-            return compose_registration(chosen, run, outputs, executor)
+            return compose_registration(chosen, run, plan, executor)
 
 
-def _tile_run(options: TileOptions, output: str | Path | None, beside: FilesBeside, progress: Progress) -> Run:
+def _tile_run(
+    options: TileOptions,
+    progress: Progress,
+    output: str | Path | None = None,
+    beside: FilesBeside = NOTHING_BESIDE,
+) -> Run:
     """A run with what the stages after registration take of the options."""
     settings = StitchOptions(
         distortion=None if options.distortion == "auto" else options.distortion,
@@ -103,8 +108,10 @@ def _tile_run(options: TileOptions, output: str | Path | None, beside: FilesBesi
         strict=options.strict,
         dry_run=options.dry_run,
         workers=options.workers,
+        topic=options.topic,
     )
-    return replace(Run.of((), settings, output, beside, progress), read=[*options.files, *settings.files])
+    run = Run.of((), settings, output=output, beside=beside, progress=progress)
+    return replace(run, read=[*options.files, *settings.files])
 
 
 @one_native_thread()
@@ -126,27 +133,25 @@ def place_tiles(
         As for :func:`tiles`.
     """
     options = with_fields(options_of(TileOptions, options), fields)
-    run = _tile_run(options, None, NOTHING_BESIDE, progress)
-    with (
-        found_images(as_tiles(inputs), topic=options.topic) as listed,
-        Outputs(options.overwrite) as outputs,
-    ):
-        registration = _registered(listed, run, options, positions_file, outputs)
+    run = replace(_tile_run(options, progress), inputs=as_tiles(inputs))
+    with run.found() as listed:
+        registration, _ = _registered(listed, run, options, positions_file)
     assert registration.tiles is not None
     return registration.tiles, registration
 
 
 def _registered(
-    listed: FoundImages, run: Run, options: TileOptions, positions_file: str | Path | None, outputs: Outputs
-) -> Registration:
-    """The places of all tiles, once it is clear that everything can be written; their tables are."""
+    listed: FoundImages, run: Run, options: TileOptions, positions_file: str | Path | None
+) -> tuple[Registration, OutputPlan]:
+    """The places of all tiles, once it is clear that everything can be written; their tables are, and what will be."""
     tables = [Path(file) for file in (positions_file, options.save_flat_field) if file is not None]
     names = [frame.name for frame in listed.frames]
-    RunFiles.of_images(run, listed.files, names, more_files=tables).check(outputs)
+    plan = OutputPlan.of_images(run, listed.files, names, more_files=tables)
+    plan.check()
     frames, stored, notes = tile_frames(listed.frames, options.z, options.time)
     limit = options.composite.max_memory
     sources, unread = read_sources(frames, skip_bad=not options.strict, guard=run.guard, max_memory=limit)
-    check_world_files([] if run.output is None else [run.output], sources, options.overwrite)
+    plan.check_places(sources)
     sources, odd = _of_one_kind(sources, options.strict)
     unread += odd
     while True:
@@ -162,8 +167,9 @@ def _registered(
                 raise
             unread += damaged
     tiled = replace(tiled, z=options.z, time=options.time)
-    _write_beside(outputs, positions_file, options, sources, tiled)
-    return tiles_as_registration(sources, tiled).with_messages([*unread, *listed.messages, *notes, *messages])
+    _write_beside(run.outputs, positions_file, options, sources, tiled)
+    registration = tiles_as_registration(sources, tiled)
+    return registration.with_messages([*unread, *listed.messages, *notes, *messages]), plan
 
 
 def _of_one_kind(sources: list[Source], strict: bool) -> tuple[list[Source], list[Message]]:

@@ -2,8 +2,9 @@
 
 import math
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
+from typing import Self
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from rdstitch.alignment.frames.vanishing_points import (
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.features.line_segments import MEGAPIXELS, line_segments
+from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import nearest_rotation
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.upright_options import UprightOptions
@@ -89,88 +91,110 @@ def _cut_away(placed: PlacedImages, options: CompositeOptions, matrix: FloatArra
     return 1.0
 
 
+@dataclass(frozen=True)
+class _Reference:
+    """The reference image, in whose frame everything is turned."""
+
+    placed: PlacedImages
+    camera: Camera
+    frame: FloatArray  # (3, 3): its undistorted coordinates to the plane, or to directions
+    focal: Focal
+
+    @classmethod
+    def of(cls, placed: PlacedImages) -> Self:
+        """That of placed images, with the focal length that the alignment has."""
+        if placed.reference is None:
+            raise ArgumentError("the reference image is not among the images: nothing can be turned upright")
+        camera, frame = placed.cameras[placed.reference], placed.homographies[placed.reference]
+        if placed.turned:
+            lengths = np.linalg.norm(frame, axis=0)
+            return cls(placed, camera, frame, Focal(float(lengths[2] / lengths[0])))
+        known = camera.with_guessed_focal()
+        assert known.focal is not None
+        return cls(placed, camera, frame, Focal(known.focal / known.scale, known.focal_log_std))
+
+    @property
+    def start(self) -> FloatArray:
+        """Its axes (3, 3) as a rotation, where a search for those of the scene begins."""
+        return nearest_rotation(np.asarray(np.linalg.inv(to_axes(self.frame, self.focal.value))))
+
+    @property
+    def from_images(self) -> FloatArray:
+        """From undistorted coordinates of each image to its own, (N, 3, 3)."""
+        return np.asarray(np.linalg.inv(self.frame) @ self.placed.homographies)
+
+    def undistorted(self, points: FloatArray) -> FloatArray:
+        """Undistorted places (N, 2) of its pixels, half diagonals from its centre."""
+        flat = self.camera.normalize(self.camera.undistort(points))
+        if not np.isfinite(flat).all():
+            raise ArgumentError(
+                "rectangle, straighten: a place lies where the lens of the reference image shows nothing"
+            )
+        return flat
+
+    def edges(self, ends: FloatArray, error: float) -> Edges:
+        """Edges by their ends (N, 2, 3) in it, undistorted."""
+        if not self.placed.turned:
+            return Edges.between(ends[(ends[:, :, 2] > 0.0).all(axis=1)], error)
+        focal = self.focal.value
+        return Edges.between(ends * (1.0, 1.0, focal), error / focal, on_sphere=True)
+
+
 def _upright(placed: PlacedImages, options: CompositeOptions) -> tuple[FloatArray | None, list[Message]]:
     """What takes the images to where the scene is upright; None where nothing shows how."""
-    frame, focal = placed.homographies[_reference(placed)], _focal(placed)
-    start = nearest_rotation(np.asarray(np.linalg.inv(to_axes(frame, focal.value))))
+    reference = _Reference.of(placed)
     upright: Upright | None
     message: Message | None
     if options.rectangle is not None:
-        upright, message = _by_rectangle(placed, np.reshape(options.rectangle, (4, 2)), focal)
+        upright, message = _by_rectangle(reference, np.reshape(options.rectangle, (4, 2)))
     elif options.straighten == "auto":
-        upright, message = _by_edges(placed, start, focal)
-    elif not isinstance(options.straighten, str):
-        upright, message = _by_lines(placed, np.reshape(options.straighten, (-1, 2)), start, focal), None
+        upright, message = _by_edges(reference)
+    elif options.straighten != "off":
+        upright, message = _by_lines(reference, np.reshape(options.straighten, (-1, 2))), None
     else:
-        upright, message = _by_gravity(placed, start, focal)
+        upright, message = _by_gravity(reference)
     messages = [] if message is None else [message]
-    return None if upright is None else upright.matrix(frame, turned=placed.turned), messages
+    return None if upright is None else upright.matrix(reference.frame, turned=placed.turned), messages
 
 
-def _reference(placed: PlacedImages) -> int:
-    """The reference image, in whose frame everything is turned."""
-    if placed.reference is None:
-        raise ArgumentError("the reference image is not among the images: nothing can be turned upright")
-    return placed.reference
-
-
-def _by_rectangle(placed: PlacedImages, corners: FloatArray, focal: Focal) -> tuple[Upright, Message]:
+def _by_rectangle(reference: _Reference, corners: FloatArray) -> tuple[Upright, Message]:
     """By the corners (4, 2) of what is a rectangle in the scene, pixels of the reference image."""
-    camera = placed.cameras[_reference(placed)]
+    camera = reference.camera
     pixel = 1.0 / camera.scale
-    upright, aspect, error = of_rectangle(_in_reference(placed, corners), focal, pixel)
+    upright, aspect, error = of_rectangle(reference.undistorted(corners), reference.focal, pixel)
     text = f"rectangle: {aspect:.4g} times as wide as high ± {error:.1%}"
     text += f", with a focal length of {upright.focal.value / pixel:.0f} pixels ({camera.focal_source or 'guess'})"
     return upright, Message(text, severity="warning" if error > _SURE else "note")
 
 
-def _by_edges(placed: PlacedImages, start: FloatArray, focal: Focal) -> tuple[Upright | None, Message]:
+def _by_edges(reference: _Reference) -> tuple[Upright | None, Message]:
     """By what seem to be horizontal and vertical edges of the scene."""
-    axes = of_scene(_edges(placed), start, focal, depth=placed.turned)
+    axes = of_scene(_detected_edges(reference), reference.start, reference.focal, depth=reference.placed.turned)
     if axes is None:
         return None, Message("no straight edges were found: the output is not turned", code="not-straightened")
     upright, across, down = axes
     return upright, Message(f"straightened by {across} horizontal and {down} vertical edges", severity="note")
 
 
-def _by_lines(placed: PlacedImages, ends: FloatArray, start: FloatArray, focal: Focal) -> Upright:
+def _by_lines(reference: _Reference, ends: FloatArray) -> Upright:
     """By ends (2 L, 2) of lines that are upright or level in the scene, pixels of the reference image."""
-    lines = _in_reference(placed, ends).reshape(-1, 2, 2)
-    error = _POINTING / placed.cameras[_reference(placed)].scale
-    edges = _between(placed, np.concatenate([lines, np.ones((len(lines), 2, 1))], axis=2), error)
+    lines, start, focal = reference.undistorted(ends).reshape(-1, 2, 2), reference.start, reference.focal
+    error = _POINTING / reference.camera.scale
+    edges = reference.edges(np.concatenate([lines, np.ones((len(lines), 2, 1))], axis=2), error)
     return of_edges(edges, nearest_axis(edges, start[:2], focal.value), start, focal, focal.value)
 
 
-def _by_gravity(placed: PlacedImages, start: FloatArray, focal: Focal) -> tuple[Upright | None, Message | None]:
+def _by_gravity(reference: _Reference) -> tuple[Upright | None, Message | None]:
     """By what was measured to be down, or is down in most images."""
-    if placed.turned:
+    if reference.placed.turned:
         return None, Message("the horizon of a panorama is level already", severity="note")
-    upright = _level(placed, start, focal)
+    upright = _level(reference)
     return upright, Message("the camera looks straight down: there is nothing to level") if upright is None else None
 
 
-def _focal(placed: PlacedImages) -> Focal:
-    """The focal length of the reference image, as the alignment has it."""
-    if placed.turned:
-        lengths = np.linalg.norm(placed.homographies[_reference(placed)], axis=0)
-        return Focal(float(lengths[2] / lengths[0]))
-    camera = placed.cameras[_reference(placed)].with_guessed_focal()
-    assert camera.focal is not None
-    return Focal(camera.focal / camera.scale, camera.focal_log_std)
-
-
-def _in_reference(placed: PlacedImages, points: FloatArray) -> FloatArray:
-    """Undistorted places (N, 2) of pixels of the reference image, half diagonals from its centre."""
-    camera = placed.cameras[_reference(placed)]
-    flat = camera.normalize(camera.undistort(points))
-    if not np.isfinite(flat).all():
-        raise ArgumentError("rectangle, straighten: a place lies where the lens of the reference image shows nothing")
-    return flat
-
-
-def _edges(placed: PlacedImages) -> Edges:
+def _detected_edges(reference: _Reference) -> Edges:
     """Straight edges in the images."""
-    to_reference = np.linalg.inv(placed.homographies[_reference(placed)]) @ placed.homographies
+    placed, to_reference = reference.placed, reference.from_images
     segments, error = [], 0.0
     for k in evenly_spaced(len(placed.sources), _MAX_IMAGES).tolist():
         camera, (ends, pixel) = placed.cameras[k], line_segments(placed.sources[k].view(MEGAPIXELS))
@@ -178,35 +202,26 @@ def _edges(placed: PlacedImages) -> Edges:
         flat = flat[np.linalg.norm(flat[:, 1] - flat[:, 0], axis=1) > _MIN_LENGTH]
         segments.append(np.concatenate([flat, np.ones((len(flat), 2, 1))], axis=2) @ to_reference[k].T)
         error = max(error, _DETECTION * pixel / camera.scale)
-    return _between(placed, np.concatenate(segments), error)
+    return reference.edges(np.concatenate(segments), error)
 
 
-def _between(placed: PlacedImages, ends: FloatArray, error: float) -> Edges:
-    """Edges by their ends (N, 2, 3) in the reference image, undistorted."""
-    if not placed.turned:
-        return Edges.between(ends[(ends[:, :, 2] > 0.0).all(axis=1)], error)
-    focal = _focal(placed).value
-    return Edges.between(ends * (1.0, 1.0, focal), error / focal, on_sphere=True)
-
-
-def _level(placed: PlacedImages, start: FloatArray, focal: Focal) -> Upright | None:
+def _level(reference: _Reference) -> Upright | None:
     """With what is down in the scene, or else in most images, down in the output; None where that is ahead."""
-    to_reference = np.linalg.inv(placed.homographies[_reference(placed)]) @ placed.homographies
-    calibration = np.diag([1.0, 1.0, focal.value])
-    measured = [source.down for source in placed.sources]
+    calibration = np.diag([1.0, 1.0, reference.focal.value])
+    measured = [source.down for source in reference.placed.sources]
     known = any(down is not None for down in measured)
     directions = [
         np.sign(matrix[2, 2]) * calibration @ matrix @ np.linalg.inv(calibration) @ (down or (0.0, 1.0, 0.0))
-        for matrix, down in zip(to_reference, measured, strict=True)
+        for matrix, down in zip(reference.from_images, measured, strict=True)
         if down is not None or not known
     ]
     down = np.mean([direction / np.linalg.norm(direction) for direction in directions], axis=0)
     down /= np.linalg.norm(down)
-    ahead = start[2]
+    ahead = reference.start[2]
     if abs(down @ ahead) > _STEEP:
         return None
     if not known:
         down -= (down @ ahead) * ahead
         down /= np.linalg.norm(down)
     right = np.cross(down, ahead)
-    return Upright(np.stack([right / np.linalg.norm(right), down]), focal)
+    return Upright(np.stack([right / np.linalg.norm(right), down]), reference.focal)

@@ -30,7 +30,7 @@ def tiles_as_registration(sources: Sequence[Source], tiled: TileRegistration) ->
             f"({tiled.grid.source}) or the overlap may be wrong; --search PX looks farther"
         )
     distortion, std = fitted.distortion, fitted.distortion_std
-    cameras = [replace(source.camera, distortion=distortion, distortion_std=std) for source in sources]
+    cameras = [replace(source.camera, distortion=distortion, distortion_std=std or None) for source in sources]
     places = fitted.places - fitted.places[0]
     exact = _homographies(cameras, places)
     pairs, fits = zip(*(_pair(tiled, cameras, exact, number) for number in range(len(links.tiles))), strict=True)
@@ -47,6 +47,7 @@ def tiles_as_registration(sources: Sequence[Source], tiled: TileRegistration) ->
         model_reason="a stage moves without turning",
         rms=rms,
         links=fits,
+        lens_reason="given" if std == 0.0 else "one parameter",
         relief=ReliefTest(False, 0.0, 0.0, "Taken to be flat: tiles on a stage."),
     )
     counts = np.bincount(links.tiles[links.pair].ravel(), minlength=len(sources))

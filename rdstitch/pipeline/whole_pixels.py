@@ -33,7 +33,7 @@ def on_whole_pixels(registration: Registration) -> Registration:
     if whole is None or np.abs(linear / unit - np.eye(2)).max() > _UPRIGHT:
         return registration
     # What was found of a camera over a plane is no property of a cut-out.
-    cameras = tuple(replace(Camera(c.image_size), distortion_std=0.0) for c in alignment.cameras)
+    cameras = tuple(Camera(c.image_size) for c in alignment.cameras)
     reference, homographies = cameras[alignment.reference], np.full_like(alignment.homographies, np.nan)
     for index, shift in zip(np.flatnonzero(alignment.used), whole, strict=True):
         camera = cameras[index]

@@ -1,6 +1,6 @@
 """The page: all sections in one self-contained HTML file; those with drawings are files of their own."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -68,11 +68,8 @@ def write_report(
     OutputError
         When the file cannot be written.
     """
-    if not isinstance(result, StitchResult | Registration):
-        raise ArgumentError(f"a report is made of a StitchResult or a Registration, not of a {type(result).__name__}")
-    output = result.output if isinstance(result, StitchResult) else None
     with Outputs.or_own(outputs) as staging:
-        page = report_page(result, stages, command, None if output is None else staging.where(output))
+        page = report_page(result, stages, command, staging.where)
         # Names of files need not be UTF-8.
         staging.write(path, page.encode("utf-8", "backslashreplace"))
 
@@ -81,19 +78,27 @@ def report_page(
     result: StitchResult | Registration,
     stages: Sequence[tuple[str, float]] = (),
     command: str = "",
-    image: Path | None = None,
+    where: Callable[[Path], Path] = lambda file: file,
 ) -> str:
-    """The report as HTML; see :func:`write_report`. ``image`` is where the image lies until it is published."""
-    registration = result.registration if isinstance(result, StitchResult) else result
-    title, output = "rdstitch report", list[str]()
+    """The report as HTML; see :func:`write_report`. ``where`` gives the file of the output until it is published."""
     if isinstance(result, StitchResult):
-        title = title if result.output is None else result.output.name
-        output = [mosaic_section(result, image or result.output), place_section(result), local_alignment(result)]
+        registration, stitched = result.registration, result
+    elif isinstance(result, Registration):
+        registration, stitched = result, None
+    else:
+        raise ArgumentError(f"a report is made of a StitchResult or a Registration, not of a {type(result).__name__}")
+    title, image = "rdstitch report", None
+    if stitched is not None and stitched.output is not None:
+        title, image = stitched.output.name, where(stitched.output)
     body: list[Content] = [
-        summary(result),
+        summary(registration, stitched),
         notices(registration),
         stage_section(registration),
-        *output,
+        *(
+            []
+            if stitched is None
+            else [mosaic_section(stitched, image), place_section(stitched), local_alignment(stitched)]
+        ),
         match_graph(registration),
         votes(registration),
         lens_curve(registration),
@@ -113,21 +118,20 @@ def report_page(
     )
 
 
-def summary(result: StitchResult | Registration) -> str:
+def summary(registration: Registration, stitched: StitchResult | None) -> str:
     """λ and everything else of which there is one number, with the verdict."""
-    registration = result.registration if isinstance(result, StitchResult) else result
     alignment, camera, reason = registration.alignment, registration.camera, registration.alignment.model_reason
     used, compared = sum(fit.used for fit in alignment.links), len(registration.pairs)
     of_copies = f"; {more} more of copies" if (more := len(alignment.holding) - used) else ""
     known = {str(source.path) for source in registration.sources}
     unread = sum(message.images[0] not in known for message in registration.left_out)
-    seen = isinstance(result, StitchResult) and result.seams.visible
-    verdict = element("p", "The result passed its own checks.", class_="good")
-    if seen:
-        verdict = element("p", "Seams are broken; the picture below shows where.", class_="bad")
     if not registration.ok:
-        failures = "; ".join(message.clause for message in registration.failures)
+        failures = "; ".join(registration.verdict.failures)
         verdict = element("p", f"Not to be relied on: {failures}", class_="bad")
+    elif stitched is not None and stitched.seams.visible:
+        verdict = element("p", "Seams are broken; the picture below shows where.", class_="bad")
+    else:
+        verdict = element("p", "The result passed its own checks.", class_="good")
     rows = [
         ("λ (half diagonal)", registration.distortion_in_words(6)),
         ("λ per px²", f"{camera.distortion_px:.4e}"),
@@ -143,8 +147,8 @@ def summary(result: StitchResult | Registration) -> str:
     if camera.focal is not None:
         std = "" if camera.focal_std is None else f" ± {camera.focal_std:.1f}"
         rows.append(("focal length", f"{camera.focal:.1f}{std} pixels ({camera.focal_source})"))
-    if isinstance(result, StitchResult):
-        rows.append(("output", "{} x {} pixels".format(*result.canvas.size)))
+    if stitched is not None:
+        rows.append(("output", "{} x {} pixels".format(*stitched.canvas.size)))
     return section("Summary", "", verdict, table(rows))
 
 
@@ -185,12 +189,16 @@ def place_section(result: StitchResult) -> str:
     """Where the output lies on the Earth, and the largest residuals of the positions that say so."""
     if (placed := result.georeference) is None:
         return ""
-    residuals = sorted(placed.residuals, key=lambda residual: -residual.off)[:_MAX_ROWS]
-    rows = [(r.name, f"{r.east:+.3f}", f"{r.north:+.3f}", "" if r.used else "not used") for r in residuals]
+    residuals = sorted(placed.residuals, key=lambda residual: -residual.distance)[:_MAX_ROWS]
+    rows = [(r.name, _signed(r.east), _signed(r.north), "" if r.used else "not used") for r in residuals]
     explanation = (
         f"{map_summary(placed)}. Where the output has them less where they were measured to be, the largest first:"
     )
     return section("Place on the Earth", explanation, table(rows, ("", "east, m", "north, m", "")))
+
+
+def _signed(value: float | None) -> str:
+    return "" if value is None else f"{value:+.3f}"
 
 
 def local_alignment(result: StitchResult) -> str:

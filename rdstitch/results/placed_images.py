@@ -1,7 +1,7 @@
 """Registered images, ready to be composited: aligned locally, without what is static."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Self
@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.compositing import Canvas
-from rdstitch.compositing.source_images import Displacement, PlacedImage
+from rdstitch.compositing.source_images import PlacedImage
 from rdstitch.compositing.static_pixels import MIN_IMAGES, static_pixels
 from rdstitch.compositing.visible_region import VisibleRegion
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.places import GpsPosition
 from rdstitch.georeferencing.georeference import Georeference
-from rdstitch.georeferencing.place_on_map import Located, has_place
+from rdstitch.georeferencing.place_on_map import AlignmentErrors, has_place
 from rdstitch.inputs.source import Source
 from rdstitch.io.radiometric_tags import Radiometry
 from rdstitch.io.read import DecodedImage
 from rdstitch.io.reduction import fitting_reduction
+from rdstitch.local_alignment import DisplacementField
 from rdstitch.results.registration import Registration
 
 # Images, and pixels of their longer side, that are compared to find what is static in them.
@@ -41,106 +41,93 @@ class SavedGrid:
 class PlacedImages:
     """The images that are used, and where they belong."""
 
-    sources: Sequence[Source]
-    cameras: Sequence[Camera]
+    sources: Sequence[Source]  # with the cameras that were found
     # (N, 3, 3): normalized undistorted coordinates of each image to the plane, or to directions
     homographies: FloatArray
     reference: int | None  # image whose resolution the output has; None for the median one's
     # what local alignment adds to the measured pixels of each image
-    displacements: Sequence[Displacement | None] | None = None
+    displacements: Sequence[DisplacementField | None] | None = None
     # whether the camera turned on the spot, so that the homographies lead to directions, not to a plane
     turned: bool = False
     place: Georeference | None = None  # of the plane, where it is known from an earlier run
-    whole: bool = False  # whether nothing of them can be static: tiles on a stage, whose ground may be black
+    tiles: bool = False  # of a stage: nothing of them is static, though their ground may be black
     # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.straighten`
     orientation: FloatArray | None = None
-    relief: float = 0.0  # pixels that neighbours are off together, where the ground is no plane
-    lever_std: float = 0.0  # see Located
-    leverage: Mapping[int | str, float] = field(default_factory=dict)  # see Located
+    errors: AlignmentErrors = field(default_factory=AlignmentErrors)
     grid: SavedGrid | None = None  # pixels that the output is made on
 
     @classmethod
-    def of(cls, registration: Registration, displacements: Sequence[Displacement | None] | None) -> Self:
+    def of(cls, registration: Registration, displacements: Sequence[DisplacementField | None] | None) -> Self:
         """Those that a registration uses."""
         alignment = registration.alignment
         used = np.flatnonzero(alignment.used)
         return cls(
             [replace(registration.sources[i], camera=alignment.cameras[i]) for i in used],
-            [alignment.cameras[i] for i in used],
             alignment.homographies[used],
             int(np.flatnonzero(used == alignment.reference)[0]),
             displacements,
             alignment.on_sphere,
-            whole=registration.tiles is not None,
-            relief=alignment.relief.size if alignment.relief.found else 0.0,
-            lever_std=alignment.lever_std,
-            leverage={**alignment.leverage, **{k: alignment.leverage.get(int(i), 0.0) for k, i in enumerate(used)}},
+            tiles=registration.tiles is not None,
+            errors=AlignmentErrors(
+                alignment.relief.size if alignment.relief.found else 0.0,
+                alignment.lever_std or None,
+                [alignment.leverage.get(i, 0.0) for i in used.tolist()],
+                {key: value for key, value in alignment.leverage.items() if isinstance(key, str)},
+            ),
         )
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Those of the images."""
+        return [source.camera for source in self.sources]
+
+    @cached_property
+    def _common_size(self) -> tuple[int, int]:
+        return Counter(camera.image_size for camera in self.cameras).most_common(1)[0][0]
 
     @cached_property
     def static(self) -> NDArray[np.bool_] | None:
         """What shows the camera's parts, or nothing, in a few images of the commonest size; None where none does."""
-        size, count = Counter(camera.image_size for camera in self.cameras).most_common(1)[0]
-        if self.whole or count < MIN_IMAGES:
+        alike = [source for source in self.sources if source.camera.image_size == self._common_size]
+        if self.tiles or len(alike) < MIN_IMAGES:
             return None
-        alike = [s for s, camera in zip(self.sources, self.cameras, strict=True) if camera.image_size == size]
-        chosen = evenly_spaced(count, _STATIC_SAMPLE).tolist()
-        reduction = fitting_reduction(max(size) / _STATIC_SIDE)
+        chosen = evenly_spaced(len(alike), _STATIC_SAMPLE).tolist()
+        reduction = fitting_reduction(max(self._common_size) / _STATIC_SIDE)
         return static_pixels([alike[k].read(reduction, keep=True).pixels for k in chosen])
-
-    @property
-    def positions(self) -> list[GpsPosition | None]:
-        """Where each image was taken; a camera that turned on the spot was at one place, and shows no plane."""
-        return [None if self.turned else source.metadata.gps for source in self.sources]
 
     @property
     def has_place(self) -> bool:
         """Whether enough is known for a place of the output on the Earth to be expected."""
         return not self.turned and has_place(self.sources)
 
-    def located(self, canvas: Canvas) -> Located:
-        """The images on a canvas with what is known of where they are."""
-        return Located(
-            self.positions,
-            self.cameras,
-            canvas.matrix @ self.homographies,
-            [source.name for source in self.sources],
-            [source.metadata.nadir for source in self.sources],
-            [source.control for source in self.sources],
-            self.relief,
-            self.lever_std,
-            self.leverage,
-        )
-
     def images(self, canvas: Canvas) -> list[PlacedImage]:
         """As the compositor takes them, with only the near parts of those that a canvas does not show whole."""
-        read: list[Callable[..., DecodedImage]] = [
-            source.read if part is None else partial(_read_near, source.read, part)
-            for source, part in zip(self.sources, canvas.near or [None] * len(self.sources), strict=True)
-        ]
-        if self.static is not None:
-            common = Counter(camera.image_size for camera in self.cameras).most_common(1)[0][0]
-            read = [
-                partial(_read_moving, reader, self.static) if camera.image_size == common else reader
-                for reader, camera in zip(read, self.cameras, strict=True)
-            ]
-        located, displacements = self.place is not None, self.displacements or [None] * len(self.sources)
-        images = zip(read, self.cameras, self.homographies, self.sources, displacements, strict=True)
+        nothing = [None] * len(self.sources)
+        parts, displacements = canvas.near or nothing, self.displacements or nothing
+        images = zip(self.sources, self.homographies, parts, displacements, strict=True)
         return [
             PlacedImage(
-                reader,
-                camera,
-                matrix,
-                reader,
-                source.metadata.exposure,
-                displacement,
-                str(source.path),
-                source.metadata.radiometry or (Radiometry() if located or source.metadata.gps else None),
-                source.metadata.channels in (3, 4),
-                source.may_be_transparent or self.static is not None,
+                read := self._reader(source, part),
+                source.camera,
+                homography,
+                preview=read,
+                exposure=source.metadata.exposure,
+                displacement=displacement,
+                path=str(source.path),
+                radiometry=source.metadata.radiometry
+                or (Radiometry() if self.place is not None or source.metadata.gps else None),
+                coloured=source.metadata.channels in (3, 4),
+                transparent=source.may_be_transparent or self.static is not None,
             )
-            for reader, camera, matrix, source, displacement in images
+            for source, homography, part, displacement in images
         ]
+
+    def _reader(self, source: Source, part: VisibleRegion | None) -> Callable[..., DecodedImage]:
+        """Reads an image, whole or reduced, without what is static in it and what is not near."""
+        read: Callable[..., DecodedImage] = source.read if part is None else partial(_read_near, source.read, part)
+        if self.static is None or source.camera.image_size != self._common_size:
+            return read
+        return partial(_read_moving, read, self.static)
 
 
 def _read_moving(read: Callable[..., DecodedImage], static: NDArray[np.bool_], reduction: int = 1) -> DecodedImage:

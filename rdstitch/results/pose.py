@@ -9,7 +9,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import TrajectoryFrame
 from rdstitch.geometry.path_frames import covariance_in_frame, in_frame, ros_covariance
-from rdstitch.options.option import Options, documented, option
+from rdstitch.options.option import Options, Range, documented, option
 from rdstitch.results.messages import Message
 from rdstitch.tracking import TrackingResult
 
@@ -22,7 +22,7 @@ class FollowedPoses(Options):
     height: float | None = option(
         None,
         "Of the first keyframe above the plane, in the unit that positions shall have; else as odometry says, or 1.",
-        above=0.0,
+        within=Range(above=0.0),
     )
     frame: TrajectoryFrame = option("enu", "See :mod:`rdstitch.geometry.path_frames`.")
 

@@ -19,8 +19,9 @@ from rdstitch.inputs.positions import metres_around_median
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.opening import check_readable
 from rdstitch.results.messages import Message, names_of, shortened
+from rdstitch.sidecar.image_record import ImageRecord
 from rdstitch.sidecar.read import SavedRegistration
-from rdstitch.sidecar.records import ImageRecord, MatchedBy
+from rdstitch.sidecar.records import MatchedBy
 from rdstitch.system.file_access import canonical_name, canonical_text, without_query
 
 _TOKEN = re.compile(r"\d+|[^\W\d_]+|[\W_]+")

@@ -1,6 +1,5 @@
 """Reading a sidecar: its fields are checked, and make the registration that was saved."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,9 +12,9 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.geometry.crs import Crs
-from rdstitch.georeferencing.georeference import Georeference, Residual
-from rdstitch.sidecar.records import VERSION, ImageRecord, OutputRecord, ResidualRecord, SidecarRecord
+from rdstitch.georeferencing.georeference import Georeference
+from rdstitch.sidecar.image_record import ImageRecord
+from rdstitch.sidecar.records import VERSION, SidecarRecord
 from rdstitch.system.file_access import read_text
 from rdstitch.system.output_checks import tiles_folder
 from rdstitch.system.outputs import Fingerprint, fingerprint
@@ -88,7 +87,7 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
     record = convert(content, SidecarRecord, file)
     composite = _composite_options(record, file)
     try:
-        return SavedRegistration(Path(path), record, composite, _place(record.output))
+        return SavedRegistration(Path(path), record, composite, record.output.place)
     except ArgumentError as error:
         raise InputError(f"{path}: output.georeference.crs: {error}") from error
 
@@ -120,29 +119,3 @@ def mismatch_with_image(saved: SavedRegistration) -> str:
     except OSError:
         return ""
     return "" if same else f"{image}: is not the image that {saved.path.name} was written with; one of them is newer"
-
-
-def _place(output: OutputRecord) -> Georeference | None:
-    """Where the output lies on the Earth; versions before did not say."""
-    record = output.georeference
-    if record is None or record.crs is None or record.pixel_to_map is None or output.plane_to_output is None:
-        return None
-    (a, b, east), (_, _, north) = record.pixel_to_map
-    return Georeference(
-        Crs(int(record.crs.removeprefix("EPSG:"))),
-        complex(a, b),
-        complex(east, north),
-        record.rms_m or 0.0,
-        record.source or "GPS positions",
-        _residuals(record.residuals),
-        record.std_m,
-        math.hypot(a, b) / (record.gsd_m or math.hypot(a, b)),
-        checks=_residuals(record.check_points),
-    )
-
-
-def _residuals(records: Sequence[ResidualRecord]) -> tuple[Residual, ...]:
-    def off(metres: float | None) -> float:
-        return math.inf if metres is None else metres
-
-    return tuple(Residual(item.name, off(item.east_m), off(item.north_m), item.used) for item in records)

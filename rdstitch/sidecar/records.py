@@ -5,80 +5,28 @@ another picture: it refuses those that it does not know. A change that would mis
 earlier versions did not have has a default.
 """
 
-from typing import Annotated, Any, Literal
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Annotated, Any, Literal, Self, cast
 
 import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType, field
 
-from rdstitch.choices import FocalSource, ProjectionName
-from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.camera_record import CameraRecord, LensRecord
-from rdstitch.local_alignment import DisplacementField, HeldOut
-from rdstitch.system.records import Count, Matrix, NonNegative, Pair, Size, Triple, check_invertible
+from rdstitch.alignment.result import LinkFit
+from rdstitch.choices import FocalSource
+from rdstitch.geometry.camera_record import CameraRecord
+from rdstitch.local_alignment import HeldOut, LocalAlignment
+from rdstitch.matching.two_view import PairRegistration
+from rdstitch.results.registration import Registration
+from rdstitch.sidecar.image_record import ImageRecord
+from rdstitch.sidecar.output_record import OutputRecord, SeamsRecord
+from rdstitch.system.records import Count, Matrix, NonNegative, Pair, Positive
 
 VERSION = 2  # version 1 had no more of a lens than λ and μ, as ``lambda`` and ``lambda2``
 
 Lens = Literal["division", "division-center", "division2", "division3"]
 Model = Literal["rigid", "similarity", "tilting", "pose", "homography", "rotation"]
-_Row = tuple[float, float, float, float]
-_Positive = Annotated[float, Meta(gt=0.0)]
-_FileName = Annotated[str, Meta(pattern=r"^[^/\\]+$", description="in the folder of the sidecar")]
-_Digest = Annotated[
-    str,
-    Meta(description="SHA-256 of the file; of a Deep Zoom image that of the list of its files, as sha256sum has it"),
-]
-
-
-class ResidualRecord(Struct):
-    """How far east and north of a position, of an image or a control point, the output has it."""
-
-    name: str
-    east_m: float | None
-    north_m: float | None
-    used: bool
-
-
-class GeoreferenceRecord(Struct, kw_only=True):
-    """Where the output lies on the Earth; or only the reason why that is not known."""
-
-    reason: str | None = None
-    crs: Annotated[str, Meta(pattern="^EPSG:[0-9]+$")] | None = None
-    gsd_m: _Positive | None = None
-    pixel_to_map: tuple[Triple, Triple] | None = None
-    north_up: bool | None = None
-    source: Literal["GPS positions", "ground control points"] | None = None
-    positions: Count = 0
-    positions_used: Count = 0
-    rms_m: NonNegative | None = None
-    std_m: NonNegative | None = None
-    residuals: list[ResidualRecord] = []
-    check_points: list[ResidualRecord] = []
-
-    def __post_init__(self) -> None:
-        if self.crs is not None and (self.pixel_to_map is None or not any(self.pixel_to_map[0][:2])):
-            raise ValueError("expected a similarity as pixel_to_map")
-
-
-class OutputRecord(Struct, kw_only=True):
-    """The image that the sidecar belongs to."""
-
-    file: _FileName | None = None
-    bytes: Count | None = None
-    sha256: _Digest | None = None
-    size: Size | None = None
-    plane_to_output: Matrix | None = None
-    projection: ProjectionName | None = None
-    orientation: Matrix | None = None
-    wraps_around: bool = False
-    field_of_view_deg: Pair | None = None
-    center_deg: Pair | None = None
-    georeference: GeoreferenceRecord | None = None
-
-    def __post_init__(self) -> None:
-        if self.plane_to_output is not None:
-            check_invertible(self.plane_to_output, "plane_to_output")
-        if self.orientation is not None:
-            check_invertible(self.orientation, "orientation")
 
 
 class BeforeAfter(Struct):
@@ -96,91 +44,10 @@ class LocalAlignmentRecord(Struct):
     cells: Annotated[int, Meta(ge=0, description="of the grid, along the longer side of an image")]
     held_out_px: BeforeAfter
 
-
-class Displacement(Struct):
-    """What local alignment adds to the pixels of an image, on a grid from its first to its last pixel."""
-
-    grid: Annotated[tuple[Annotated[int, Meta(ge=2)], Annotated[int, Meta(ge=2)]], Meta(description="columns and rows")]
-    px: Annotated[list[Pair], Meta(description="x and y at every node, row by row")]
-
-    def __post_init__(self) -> None:
-        if len(self.px) != self.grid[0] * self.grid[1]:
-            raise ValueError(f"expected {self.grid[0] * self.grid[1]} displacements, not {len(self.px)}")
-
-
-class BreakRecord(Struct):
-    """A stretch of a seam whose two sides do not fit, px of the output."""
-
-    images: tuple[str, str]
-    x: float
-    y: float
-    length_px: NonNegative
-    shift_px: NonNegative | None
-
-
-class SeamsRecord(Struct):
-    """How many places along the seams have texture on both sides, how many are broken, and where."""
-
-    places: Count
-    broken: Count
-    breaks: list[BreakRecord]
-
-
-class PoseRecord(Struct):
-    """Where the camera was, in heights of the reference image."""
-
-    x: float
-    y: float
-    height: _Positive
-    yaw_deg: float
-    tilt_deg: Pair
-    covariance: Annotated[
-        tuple[_Row, _Row, _Row, _Row] | None, Meta(description="of x, y, height and yaw, heights and radians")
-    ] = None
-
-
-class ImageRecord(LensRecord):
-    """One image; one that could not be read has no size."""
-
-    name: str
-    path: str
-    size: Size | None
-    used: bool
-    reason: str
-    features: Count | None = None
-    to_plane: Matrix | None = None
-    to_output: Matrix | None = None
-    displacement: Displacement | None = None
-    pose: PoseRecord | None = None
-    timestamp: Annotated[float, Meta(description="s since 1970, by EXIF")] | None = None
-    gps: (
-        Annotated[
-            tuple[float, float, float | None], Meta(description="latitude and longitude, degrees; altitude, m, or null")
-        ]
-        | None
-    ) = None
-
-    def __post_init__(self) -> None:
-        if self.size is not None:
-            self.lens(self.size)
-        if self.used and (self.size is None or self.to_plane is None):
-            raise ValueError(f"is used, and needs {'size' if self.size is None else 'to_plane'}")
-        if self.to_plane is not None:
-            check_invertible(self.to_plane, "to_plane")
-        if not self.used:
-            self.to_plane = None
-
-    @property
-    def camera(self) -> Camera | None:
-        """With everything that was estimated; None where the image could not be read."""
-        return None if self.size is None else self.lens(self.size)
-
-    def displacement_field(self) -> DisplacementField | None:
-        """What local alignment found; None where the image was not aligned locally."""
-        if self.displacement is None or self.size is None or not self.used:
-            return None
-        columns, rows = self.displacement.grid
-        return DisplacementField(self.size, np.array(self.displacement.px, dtype=np.float64).reshape(rows, columns, 2))
+    @classmethod
+    def of(cls, local: LocalAlignment) -> Self:
+        """The record of a local alignment."""
+        return cls(bool(local.fields), local.reason, local.cells, BeforeAfter(local.before, local.after))
 
 
 class PairRecord(Struct, kw_only=True):
@@ -203,6 +70,29 @@ class PairRecord(Struct, kw_only=True):
     inliers_of_whole: Count | None
     rms_of_whole_px: float | None
 
+    @classmethod
+    def of(cls, pair: PairRegistration, fit: LinkFit | None, names: Sequence[str]) -> Self:
+        """The record of a pair, and how it fits the alignment; ``names`` are those of all images."""
+        relation = pair.relation
+        return cls(
+            images=(names[pair.image1], names[pair.image2]),
+            matches=len(pair.matches),
+            inliers=int(relation.inliers.sum()),
+            rms_px=relation.rms,
+            lambda_=relation.distortion,
+            lambda_std=relation.distortion_std if relation.ok else None,
+            model=cast(Model | None, relation.model or None),
+            homography=relation.homography.tolist() if relation.ok else None,
+            solver=relation.solver or None,
+            iterations=relation.iterations,
+            ok=relation.ok,
+            reason=relation.reason,
+            used=fit is not None and fit.used,
+            dropped="" if fit is None else fit.reason,
+            inliers_of_whole=None if fit is None else fit.inliers,
+            rms_of_whole_px=None if fit is None else fit.rms,
+        )
+
 
 class ReliefRecord(Struct):
     """Whether the scene is the plane that it is taken for."""
@@ -217,9 +107,15 @@ class VerdictRecord(Struct):
     """Whether the result can be relied on."""
 
     ok: bool
-    failures: list[str] = []
-    warnings: list[str] = []
+    failures: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
     relief: ReliefRecord | None = None
+
+    @classmethod
+    def of(cls, registration: Registration) -> Self:
+        """The record of the verdict on a registration."""
+        verdict, relief = registration.verdict, ReliefRecord(**asdict(registration.alignment.relief))
+        return cls(verdict.ok, verdict.failures, verdict.warnings, relief)
 
 
 class TileRecord(Struct):
@@ -236,7 +132,7 @@ class StageRecord(Struct, kw_only=True):
     """What a stage does: the matrix from its pixels to the camera's, and what its lines are off, px."""
 
     source: str
-    pixel_um: _Positive | None
+    pixel_um: Positive | None
     z: int | Literal["max"] | None = None
     time: int | None = None
     matrix: tuple[Pair, Pair]
@@ -246,6 +142,33 @@ class StageRecord(Struct, kw_only=True):
     column_std_px: NonNegative | None
     tile_std_px: NonNegative
     tiles: list[TileRecord]
+
+    @classmethod
+    def of(cls, registration: Registration) -> Self | None:
+        """The record of the stage of a registration; None where the images are no tiles."""
+        if registration.tiles is None:
+            return None
+        grid, model = registration.tiles.grid, registration.tiles.adjustment.stage
+        # Whole pixels are another source of error.
+        rounding = 0.0 if registration.alignment.distortion else math.sqrt(1.0 / 12.0)
+        stds = np.hypot(registration.tiles.stds, rounding).tolist()
+        tiles = zip(registration.sources, grid.rows, grid.columns, registration.tiles.linked, stds, strict=True)
+        return cls(
+            source=grid.source,
+            pixel_um=grid.pixel_size,
+            z=registration.tiles.z,
+            time=registration.tiles.time,
+            matrix=model.matrix.tolist(),
+            rows_px=model.rows.tolist(),
+            columns_px=model.columns.tolist(),
+            row_std_px=model.row_std,
+            column_std_px=model.column_std,
+            tile_std_px=model.std,
+            tiles=[
+                TileRecord(source.name, int(row), int(column), "overlap" if linked else "stage", std)
+                for source, row, column, linked, std in tiles
+            ],
+        )
 
 
 # How given images found the registered ones whose places they take.

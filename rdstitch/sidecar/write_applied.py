@@ -1,4 +1,4 @@
-"""The sidecar of an image that was composed again: what was estimated then, of the images that are in it now."""
+"""The sidecar of an image that was composed again: the registration of then, with the images that are in it now."""
 
 from pathlib import Path
 from typing import Any
@@ -6,102 +6,109 @@ from typing import Any
 from msgspec import UNSET
 from msgspec.structs import replace as replace_fields
 
-from rdstitch.arrays import FloatArray
+from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.camera_record import CameraRecord, camera_record, lens_fields
 from rdstitch.geometry.exif_orientation import inverse
-from rdstitch.sidecar.parts import (
-    displacement_record,
-    output_record,
-    rebased_path,
-    recorded_path,
-    seams_record,
-    taken_fields,
-    to_output,
-    versions,
-)
+from rdstitch.sidecar.image_record import ImageRecord, image_fields, placement_fields
+from rdstitch.sidecar.output_record import OutputRecord, SeamsRecord
+from rdstitch.sidecar.paths import rebased_path, recorded_path
 from rdstitch.sidecar.recomposition import Recomposition
-from rdstitch.sidecar.records import VERSION, Applied, ImageRecord
+from rdstitch.sidecar.records import VERSION, Applied
+from rdstitch.sidecar.write import versions
 from rdstitch.system.file_access import is_url
 from rdstitch.system.records import to_jsonable
+
+_OF_ANOTHER_LENS = {
+    "lambda_std": None,
+    "lambda_known": False,
+    "tilt_deg": None,
+    "rms_px": None,
+    "lens_reason": "that of another band, from what images of both show",
+}
+"""What is not known of the lens of another band."""
 
 
 def applied_sidecar(result: Recomposition, *, same_lens: bool) -> dict[str, Any]:
     """The content of the sidecar, which can be applied like any other; pairs stay in the one that was applied."""
-    saved, then = result.saved, result.saved.record
-    sources = {index: source for index, source in enumerate(result.sources) if source is not None}
-    to_plane = dict(zip(sources, result.placed.homographies, strict=True))
-    # An image without any image in it is never written.
-    source = sources.get(saved.reference) or next(iter(sources.values()))
-    # How far the camera was determined then.
-    names = ("lens_covariance", "lambda_observable", "tilt_deg", "tilt_std_deg")
-    determined = {name: getattr(then.camera, name) for name in names}
-    determined |= {"lambda_std": then.lambda_std, "focal_std_px": _resized_std(then.camera, source.camera.focal)}
-    camera = camera_record(source.camera.turned(inverse(source.metadata.orientation)))
-    if same_lens:
-        camera = replace_fields(camera, **determined)
-    of_lens = {"lambda_std": None, "lambda_known": False, "tilt_deg": None, "rms_px": None}
-    now = replace_fields(
-        then,
-        **({} if same_lens else of_lens | {"lens_reason": "that of another band, from what images of both show"}),
+    saved, record = result.saved, result.saved.record
+    reference = result.sources[saved.reference] or result.placed.sources[0]
+    stored_camera = reference.camera.turned(inverse(reference.metadata.orientation))
+    camera = _with_errors_of(record.camera, stored_camera) if same_lens else camera_record(stored_camera)
+    placed = (index for index, source in enumerate(result.sources) if source is not None)
+    positions = {index: k for k, index in enumerate(placed)}  # of registered images among those of the output
+    record = replace_fields(
+        record,
+        **({} if same_lens else _OF_ANOTHER_LENS),
         version=VERSION,
         lambda_=camera.lambda_,
         lambda_px=camera.lambda_px,
         lambda_focal=camera.lambda_focal,
         camera=camera,
         focal_px=camera.focal_px,
-        reference=source.name,
-        output=output_record(result, turned=saved.turned),
-        seams=seams_record(result.seams, [source.name for source in sources.values()]),
+        reference=reference.name,
+        output=OutputRecord.of(result),
+        seams=SeamsRecord.of(result),
         images=[
-            _used_image(result, index, to_plane[index], same_lens=same_lens)
-            if index in sources
+            _used_image(result, index, positions[index], same_lens=same_lens)
+            if index in positions
             else _unused_image(result, index)
             for index in range(len(saved.images))
         ],
         pairs=[],
-        options={**then.options, "composite": result.options.composite},
+        options={**record.options, "composite": result.options.composite},
         versions=versions(),
         applied=Applied(recorded_path(saved.path, result.output), result.matched),
     )
-    content: dict[str, Any] = to_jsonable(now)
+    content: dict[str, Any] = to_jsonable(record)
     return content
 
 
-def _used_image(result: Recomposition, index: int, to_plane: FloatArray, *, same_lens: bool) -> ImageRecord:
-    """The record of an image, with what took its place."""
-    image, source = result.saved.images[index], result.sources[index]
-    assert source is not None
-    field, size, original = image.displacement_field(), source.camera.image_size, result.saved.original(image)
+def _with_errors_of(registered: CameraRecord, camera: Camera) -> CameraRecord:
+    """The record of a camera of the lens that was registered, perhaps on images of another size, with its errors."""
+    record, focal_std = camera_record(camera), registered.focal_std_px
+    if focal_std is not None and registered.focal_px and record.focal_px:
+        focal_std *= record.focal_px / registered.focal_px
+    return replace_fields(
+        record,
+        lambda_std=registered.lambda_std,
+        lambda_observable=registered.lambda_observable,
+        lens_covariance=registered.lens_covariance,
+        focal_std_px=focal_std,
+        tilt_deg=registered.tilt_deg,
+        tilt_std_deg=registered.tilt_std_deg,
+    )
+
+
+def _used_image(result: Recomposition, index: int, position: int, *, same_lens: bool) -> ImageRecord:
+    """The record of a registered image, with the one that took its place."""
+    image, source = result.saved.images[index], result.placed.sources[position]
+    original = result.saved.original(image)
     is_original = original is not None and original.resolve() == source.path.resolve()
     return replace_fields(
         image,
-        name=source.name,
-        path=recorded_path(source.path, result.output),
-        size=size,
         features=image.features if is_original else None,
         pose=image.pose if same_lens else None,
-        to_plane=to_plane.tolist(),
-        to_output=to_output(result.canvas, to_plane),
-        displacement=displacement_record(None if field is None else field.resized(size)),
         lambda2=UNSET,
-        **taken_fields(source),
-        **lens_fields(source.camera),
+        **image_fields(source, source.camera, result.output),
+        **placement_fields(result, position),
     )
 
 
 def _unused_image(result: Recomposition, index: int) -> ImageRecord:
-    """The record of an image that is not in the output."""
+    """The record of a registered image that is not in the output."""
     image, left_out = result.saved.images[index], result.left_out.get(index)
-    lens = {} if image.camera is None else lens_fields(image.camera)
-    reason = image.reason if left_out is None else left_out.text
-    gone = {"used": False, "reason": reason, "to_plane": None, "to_output": None, "pose": None}
+    path = image.path
     # An array has a name without an ending, and no file.
-    if not is_url(image.path) and (Path(image.path).suffix or result.saved.original(image)):
-        gone["path"] = rebased_path(Path(image.path), result.saved.path.parent, result.output)
-    return replace_fields(image, **lens, **gone, lambda2=UNSET)
-
-
-def _resized_std(then: CameraRecord, focal: float | None) -> float | None:
-    """The standard deviation that a focal length had, for the same lens on an image of another size."""
-    std, former = then.focal_std_px, then.focal_px
-    return std * (focal / former) if std and former and focal else None
+    if not is_url(path) and (Path(path).suffix or result.saved.original(image)):
+        path = rebased_path(Path(path), result.saved.path.parent, result.output)
+    return replace_fields(
+        image,
+        path=path,
+        used=False,
+        reason=image.reason if left_out is None else left_out.text,
+        to_plane=None,
+        to_output=None,
+        pose=None,
+        lambda2=UNSET,
+        **({} if image.camera is None else lens_fields(image.camera)),
+    )

@@ -13,16 +13,16 @@ class _Late(ModuleType):
 if TYPE_CHECKING:
     import imagecodecs
     import tifffile
-    from scipy import fft, optimize, sparse, spatial, special
+    from scipy import fft, optimize, sparse, spatial
     from scipy.sparse import csgraph
     from scipy.sparse import linalg as sparse_linalg
 else:
-    fft, optimize, sparse, spatial, special, csgraph, sparse_linalg, tifffile, imagecodecs = map(
+    fft, optimize, sparse, spatial, csgraph, sparse_linalg, tifffile, imagecodecs = map(
         _Late,
         (
-            *("scipy.fft", "scipy.optimize", "scipy.sparse", "scipy.spatial", "scipy.special"),
+            *("scipy.fft", "scipy.optimize", "scipy.sparse", "scipy.spatial"),
             *("scipy.sparse.csgraph", "scipy.sparse.linalg", "tifffile", "imagecodecs"),
         ),
     )
 
-__all__ = ["csgraph", "fft", "imagecodecs", "optimize", "sparse", "sparse_linalg", "spatial", "special", "tifffile"]
+__all__ = ["csgraph", "fft", "imagecodecs", "optimize", "sparse", "sparse_linalg", "spatial", "tifffile"]

@@ -163,7 +163,7 @@ class Outputs:
                 stage()
         except Exception as error:  # noqa: BLE001 the work of hours is not thrown away for a page, whatever is wrong
             text = str(error) if isinstance(error, RdstitchError) else f"{type(error).__name__}: {error}"
-            older = "; the file of this name is older" if Path(path).exists() else ""
+            older = "; the file of this name is older" if Path(path).exists() and Path(path) not in self._made else ""
             return [Message(f"{path}: not written, all else is: {text.removeprefix(f'{path}: ')}{older}")]
         return []
 

@@ -20,6 +20,7 @@ _MIN_ENTRY, _MAX_ENTRY = 1e-30, 1e30  # of matrices
 Kind = TypeVar("Kind")
 Count = Annotated[int, Meta(ge=0)]
 NonNegative = Annotated[float, Meta(ge=0.0)]
+Positive = Annotated[float, Meta(gt=0.0)]
 Side = Annotated[int, Meta(ge=1, le=10**7)]
 Size = Annotated[tuple[Side, Side], Meta(description="width and height, px")]
 Pair = tuple[float, float]

@@ -10,8 +10,8 @@ from rdstitch.alignment.result import Alignment, LinkFit
 from rdstitch.choices import Purpose
 from rdstitch.matching.two_view import Pair
 from rdstitch.results.registration import Registration
+from rdstitch.robust.chance import binomial_tail
 from rdstitch.system.cache import NO_CACHE, Cache
-from rdstitch.system.late_imports import special
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.overlap_check import CheckedLink, ComparedImages, check_overlaps
 
@@ -74,8 +74,7 @@ class ResultEvidence:
         cells, confirming = sum(each.cells for each in overlaps), sum(each.confirming for each in overlaps)
         if cells < Limits.min_cells or confirming < Limits.max_unlike_fraction * cells:
             return False
-        # So many or more of independent cells.
-        return float(special.bdtrc(confirming - 1, cells, Limits.alike_by_chance)) < Limits.max_chance
+        return binomial_tail(confirming, cells, Limits.alike_by_chance) < Limits.max_chance
 
     @cached_property
     def alike_fraction(self) -> float:

@@ -48,7 +48,8 @@ def test_known_lens_is_kept(rdstitch: Run, frames: list[Path], tmp_path: Path, h
     rdstitch("pano", *frames[:2], "-o", tmp_path / "pano.jpg", *known, *CACHED, out="-0.210000\n")
     record = sidecar_of(tmp_path / "pano.jpg")
     assert record["lambda_known"] is True
-    assert record["lambda_std"] in (None, 0.0)
+    assert record["lambda_std"] == 0.0
+    assert (record["camera"]["lambda_std"], record["camera"]["lambda_observable"]) == (None, True)
 
 
 def test_an_image_without_overlap_is_named(rdstitch: Run, frames: list[Path], stranger: Path, tmp_path: Path) -> None:

@@ -177,7 +177,7 @@ def test_an_image_of_the_folder_is_never_replaced(rdstitch: Run, located: Path, 
     ("made_by", "name"),
     [
         ("rdstitch.report.page.report_page", "report.html"),
-        ("rdstitch.pipeline.run_files.viewer_page", "field.html"),
+        ("rdstitch.pipeline.viewer_pages.viewer_page", "field.html"),
         ("rdstitch.camera_files.camera_file_text", "camera.json"),
         ("rdstitch.georeferencing.georeference.Georeference.world_file_texts", "field.jgw"),
     ],
@@ -206,8 +206,15 @@ def test_an_earlier_page_is_older(
 ) -> None:
     arguments = ("mosaic", located / "flight", "-o", tmp_path / "field.dzi", *FAST, "--overwrite")
     rdstitch(*arguments)
-    monkeypatch.setattr("rdstitch.pipeline.run_files.viewer_page", lambda *_: 1 // 0)
+    monkeypatch.setattr("rdstitch.pipeline.viewer_pages.viewer_page", lambda *_: 1 // 0)
     assert "the file of this name is older" in rdstitch(*arguments).err
+
+
+def test_a_map_that_cannot_be_made_leaves_nothing(rdstitch: Run, located: Path, tmp_path: Path) -> None:
+    arguments = ("mosaic", located / "flight", "-o", tmp_path / "field.png", "--model", "homography", *FAST)
+    done = rdstitch(*arguments, "--map-server", tmp_path / "map", "--height", "9", told="map: not written")
+    assert "is older" not in done.err
+    assert not (tmp_path / "map").exists()
 
 
 def test_layers_lie_where_the_output_does(rdstitch: Run, located: Path, tmp_path: Path) -> None:

@@ -114,6 +114,13 @@ def _check(rdstitch: Run, folder: Path, arguments: list[str], status: int, *told
         (PANO + "--save-camera more/../out.png.json", 6, "is the name of two outputs"),
         ("mosaic a.png b.png -o x.dzi --report x.html", 6, "two outputs"),
         ("mosaic a.png b.png -o x.png --poses x.png.json", 6, "two outputs"),
+        # What could only fail after the work.
+        (MOSAIC + "--poses geo.txt", 2, "geo.txt: poses on the map need GPS positions"),
+        (MOSAIC + "--poses poses.csv --frame map", 2, "choose another --frame"),
+        (FOLLOW + "new.png --dry-run", 2, "--follow has no --dry-run"),
+        ("trajectory a.png stranger.png -o path.csv --odometry drive.csv", 3, "drive.csv: "),
+        *((PATH + f"--model {model}", 2, f"a {model} model has no path") for model in ("rotation", "homography")),
+        ("mosaic . --exclude *.png -o out.png", 2, "--exclude and --include-only leave 0 of 3 images"),
         ("trajectory a.png b.png -o path --plot path", 6, "path: is the name of two outputs"),
         ("calibrate a.png b.png -o camera.txt", 6, ".yml"),
         ("undistort a.png -o . --lambda -0.2", 6, "a.png: is read as input"),

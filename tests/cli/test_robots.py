@@ -18,7 +18,7 @@ from examples.judging.trajectories import compare_trajectories
 from examples.worlds.floor_drives import read_path, true_path
 from examples.worlds.paths import drive_poses
 from rdstitch.camera_files import load_camera
-from rdstitch.camera_files.lens_models import nearest_model
+from rdstitch.camera_files.lens_models import RATIONAL, nearest_model
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.rosbag import camera_in
 from rdstitch.io import read_image
@@ -122,7 +122,7 @@ def _write_bag(
 
 
 def _camera_info(store: Any, header: Any, camera: Camera, margin: int) -> Any:
-    lens, _, _ = nearest_model(camera, {"rational": ""})
+    lens, _, _ = nearest_model(camera, {RATIONAL: ""})
     x, y = (value + margin for value in camera.center)
     k = np.array([camera.focal, 0.0, x, 0.0, camera.focal, y, 0.0, 0.0, 1.0])
     p = np.insert(k.reshape(3, 3), 3, 0.0, axis=1).ravel()
@@ -244,8 +244,10 @@ def test_a_calibrated_focal_length_is_as_sure_as_it_was(rdstitch: Run, tmp_path:
     assert abs(scale * 0.42 - 1.0) < 3.0 * float(stated[1]) / 100.0
 
 
-def test_python_gets_labels_too(frames: list[Path]) -> None:
-    path, _ = rdstitch.trajectory(frames, options=rdstitch.StitchOptions(focal=380.0, workers=1))
+def test_python_gets_labels_and_a_camera_file_too(frames: list[Path], tmp_path: Path) -> None:
+    options = rdstitch.StitchOptions(focal=380.0, workers=1, save_camera=tmp_path / "camera.json")
+    path, registration = rdstitch.trajectory(frames, options=options)
+    assert rdstitch.load_camera(tmp_path / "camera.json").distortion == registration.camera.distortion
     assert path.name == tuple(frame.name for frame in frames)
     assert path.source_frame.tolist() == [0, 1, 2]
     assert np.isnan(path.timestamp).all()

@@ -18,8 +18,8 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.camera_record import camera_json
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.sidecar import parts
 from rdstitch.sidecar.read import read_sidecar
+from rdstitch.sidecar.write import versions
 from rdstitch.system.records import parse_json, to_jsonable
 from tests.damaged_texts import damaged, damaged_text
 
@@ -223,6 +223,6 @@ def test_another_wheel_of_opencv_will_do(monkeypatch: pytest.MonkeyPatch) -> Non
         return "1.2"
 
     monkeypatch.setattr("importlib.metadata.version", only_rdstitch)
-    found = parts.versions()
+    found = versions()
     assert (found["rdstitch"], found["opencv"]) == ("1.2", cv2.__version__)
     assert all(found.values())

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from rdstitch.options.feature_options import FeatureOptions
-from rdstitch.options.files_beside import FilesBeside
-from rdstitch.options.option import Option
+from rdstitch.options.files_beside import ReportFile
+from rdstitch.options.option import FileUse, Option
 from rdstitch.options.shared_options import Every
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch_cli.flags import Inputs, command, flags_of
@@ -21,7 +21,7 @@ from rdstitch_cli.terminal import Reporter
 """,
     flags_of(StitchOptions, without="odometry reference gcp check_points local_alignment dry_run save_camera"),
     flags_of(FeatureOptions),
-    flags_of(FilesBeside, only="report"),
+    flags_of(ReportFile),
 )
 def calibrate(
     inputs: Inputs,
@@ -31,7 +31,7 @@ def calibrate(
             "Camera file to write: .json, or in the format of others, see --camera-format.",
             "FILE",
             "-o --output",
-            writes=True,
+            file=FileUse.WRITTEN,
         ),
     ],
     every: Every = None,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import click
 
 from rdstitch.options.files_beside import FilesBeside
-from rdstitch.options.option import Option
+from rdstitch.options.option import Option, Range
 from rdstitch.options.shared_options import Every
 from rdstitch.results.messages import shortened
 from rdstitch_cli.flags import ImageFile, Inputs, PrintSidecar, command, flags_of
@@ -64,7 +64,7 @@ def mosaic(
         Option(
             "With --follow: seconds between updates of the preview, OUTPUT with .preview.jpg; 0: none.",
             "SECONDS",
-            least=0.0,
+            within=Range(least=0.0),
         ),
     ] = 5.0,
     preview: Preview = False,
@@ -80,6 +80,8 @@ def mosaic(
     list on standard input, a video, or a ROS bag. Images that do not fit are left out and named on standard error.
     With --follow, frames are registered as they arrive.
     """
+    if following and given["dry_run"]:
+        raise click.UsageError("--follow has no --dry-run: frames are registered as they arrive")
     if all_blocks and (following or given["strict"]):
         raise click.UsageError("--all-blocks goes neither with --follow nor with --strict")
     if bands is not None and (all_blocks or following or given["dry_run"]):
@@ -101,19 +103,18 @@ def mosaic(
             names = shortened(block.registration.used_names)
             report_result(block, reporter, as_json=as_json, more=f" ({names})")
     else:
+        from rdstitch.pipeline.output_plan import OutputPlan
         from rdstitch.pipeline.recipes import mosaic as recipe
         from rdstitch.pipeline.run import Run
-        from rdstitch.pipeline.run_files import RunFiles
 
         with ExitStack() as stack:
             paths: Sequence[Named]
-            live: dict[str, Any]
             if following:
                 file = output.with_suffix(".preview.jpg") if refresh else None
-                run = Run.of(inputs, options, output, beside)
-                files = RunFiles.of_images(run, inputs, more_files=[] if file is None else [file])
-                options, live = run.options, {"every": every, "idle": idle, "preview": file, "refresh": refresh}
-                paths = stack.enter_context(followed(inputs, run, files, reporter, **live))
+                run = Run.of(inputs, options, output=output, beside=beside, every=every)
+                plan = OutputPlan.of_images(run, inputs, more_files=[] if file is None else [file])
+                options, live = run.options, followed(plan, reporter, idle=idle, preview=file, refresh=refresh)
+                paths = stack.enter_context(live)
             else:
                 paths = resolve(inputs)
             result = recipe(paths, output, options, **how)

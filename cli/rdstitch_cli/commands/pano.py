@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from rdstitch.options.files_beside import FilesBeside
+from rdstitch.options.files_beside import ImageFiles
 from rdstitch.options.shared_options import Every
 from rdstitch_cli.flags import ImageFile, Inputs, PrintSidecar, command, flags_of
 from rdstitch_cli.stitching import STITCHING, Preview, files_beside, report_result, resolve, stitch_options
@@ -16,7 +16,7 @@ from rdstitch_cli.terminal import Reporter
   rdstitch pano a.jpg b.jpg -o ab.tif --camera camera.json
 """,
     STITCHING,
-    flags_of(FilesBeside, only="report layers whole_layers hugin_project"),
+    flags_of(ImageFiles),
 )
 def pano(
     inputs: Inputs,

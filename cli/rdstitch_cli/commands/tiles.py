@@ -8,8 +8,8 @@ import click
 
 from rdstitch.errors import PartialResultError
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.options.files_beside import FilesBeside
-from rdstitch.options.option import Option
+from rdstitch.options.files_beside import ReportFile
+from rdstitch.options.option import FileUse, Option
 from rdstitch.options.tile_options import TileOptions, measured_samples
 from rdstitch_cli.flags import Inputs, PrintSidecar, command, flags_of, values_of
 from rdstitch_cli.stitching import files_beside, report_registration, report_result, resolve
@@ -32,14 +32,16 @@ if TYPE_CHECKING:
 """,
     flags_of(TileOptions),
     flags_of(measured_samples(), only="blend crop interpolation background max_memory scale max_size quality"),
-    flags_of(FilesBeside, only="report"),
+    flags_of(ReportFile),
 )
 def tiles(
     inputs: Inputs,
     output: Annotated[
         Path | None,
         Option(
-            "Image to write: .ome.tif, .ome.zarr, .tif, .png, .jpg, .webp or .dzi.", flag="-o --output", writes=True
+            "Image to write: .ome.tif, .ome.zarr, .tif, .png, .jpg, .webp or .dzi.",
+            flag="-o --output",
+            file=FileUse.WRITTEN,
         ),
     ] = None,
     positions_only: Annotated[
@@ -48,7 +50,7 @@ def tiles(
             "Write the places of the tiles to this CSV file, or to a .txt as Fiji's list; without --output nothing is "
             "composed.",
             "FILE",
-            writes=True,
+            file=FileUse.WRITTEN,
         ),
     ] = None,
     as_json: PrintSidecar = False,

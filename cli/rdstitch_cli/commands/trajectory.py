@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
 from rdstitch.options.feature_options import FeatureOptions
-from rdstitch.options.option import Option
+from rdstitch.options.option import FileUse, Option
 from rdstitch.options.shared_options import Every, Height
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch_cli.flags import Inputs, command, flags_of
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 )
 def trajectory(
     inputs: Inputs,
-    output: Annotated[Path, Option("File to write.", "FILE", "-o --output", writes=True)],
+    output: Annotated[Path, Option("File to write.", "FILE", "-o --output", file=FileUse.WRITTEN)],
     *,
     file_format: Annotated[
         TrajectoryFormat,
@@ -50,7 +50,7 @@ def trajectory(
         ),
     ] = None,
     height: Height = None,
-    plot: Annotated[Path | None, Option("Draw the path to FILE (SVG).", "FILE", writes=True)] = None,
+    plot: Annotated[Path | None, Option("Draw the path to FILE (SVG).", "FILE", file=FileUse.WRITTEN)] = None,
     every: Every = 1,
     following: Following = False,
     idle: Idle = None,
@@ -64,19 +64,19 @@ def trajectory(
     poses are printed as frames arrive.
     """
     from rdstitch.export.trajectory_files import frame_of
+    from rdstitch.pipeline.output_plan import OutputPlan
     from rdstitch.pipeline.recipes import trajectory as recipe
     from rdstitch.pipeline.run import Run
-    from rdstitch.pipeline.run_files import RunFiles
     from rdstitch.results.pose import FollowedPoses
 
     options = stitch_options(given)
     with ExitStack() as stack:
         paths: Sequence[Named]
         if following:
-            run = Run.of(inputs, options, purpose=Purpose.TRAJECTORY)
-            files, options = RunFiles.of_path(run, inputs, output, plot, file_format), run.options
+            run = Run.of(inputs, options, Purpose.TRAJECTORY, every=every)
+            plan, options = OutputPlan.of_path(run, inputs, output, plot, file_format), run.options
             poses = FollowedPoses(height, frame or frame_of(file_format))
-            paths = stack.enter_context(followed(inputs, run, files, reporter, every=every, idle=idle, poses=poses))
+            paths = stack.enter_context(followed(plan, reporter, idle=idle, poses=poses))
         else:
             paths = resolve(inputs)
         _, registration = recipe(

@@ -6,7 +6,7 @@ from typing import Annotated
 import click
 
 from rdstitch.choices import Framing, ImageFormat
-from rdstitch.options.option import Option
+from rdstitch.options.option import FileUse, Option
 from rdstitch.options.shared_options import Distortion, Overwrite, Topic
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch_cli.flags import Inputs, command, flags_of
@@ -24,7 +24,7 @@ from rdstitch_cli.terminal import Reporter
 def undistort(
     inputs: Inputs,
     camera: Path | None,
-    output: Annotated[Path, Option("Folder to write to; made if missing.", "DIR", "-o --output", writes=True)],
+    output: Annotated[Path, Option("Folder to write to; made if missing.", "DIR", "-o --output", file=FileUse.WRITTEN)],
     view: Annotated[
         Framing, Option("Field of view: size and scale of the image, everything it shows, or without empty borders.")
     ] = "same",

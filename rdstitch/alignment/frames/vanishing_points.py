@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.planar_motion import nearest_rotation, rotation_about
-from rdstitch.system.late_imports import special
+from rdstitch.robust.chance import binomial_tail
 
 _TOLERANCE = math.radians(1.0)  # between an edge and the line from its middle to its vanishing point
 _CROOKED = math.radians(0.2)  # standard deviation of edges that should be parallel, besides that of their ends
@@ -234,7 +234,7 @@ def _false_alarms(of_axis: BoolArray, fitting: BoolArray) -> float:
     Edges come in pairs, one on each side of a line; only half of them count.
     """
     count, fit = int(of_axis.sum()) // 2, int((of_axis & fitting).sum()) // 2
-    return float(count**2 / 2.0 * special.bdtrc(fit - 1, count, _TOLERANCE / (np.pi / 4))) if fit else math.inf
+    return float(count**2 / 2.0 * binomial_tail(fit, count, _TOLERANCE / (np.pi / 4))) if fit else math.inf
 
 
 def _best_axes(edges: Edges, start: FloatArray, focal: float, *, depth: bool) -> tuple[FloatArray, float]:

@@ -18,7 +18,12 @@ from rdstitch.alignment.least_squares.link_equations import (
     trial_errors,
     whitened_errors,
 )
-from rdstitch.alignment.least_squares.normal_equations import ImageEquations, SparseNormalEquations, assemble
+from rdstitch.alignment.least_squares.normal_equations import (
+    ImageEquations,
+    SparseNormalEquations,
+    Structure,
+    assemble,
+)
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import ModelMatrices, MotionModel
@@ -298,7 +303,7 @@ class BundleAdjuster:
             self.observations,
             state.matrices,
             state.homographies,
-            self.free.poses,
+            self._structure,
             self.weight(sigma),
             self._of_marks(state),
         )
@@ -311,6 +316,10 @@ class BundleAdjuster:
         return normal.with_priors(
             p.poses_precision, poses, derivative.T @ (precision[:, None] * derivative), derivative.T @ slope
         )
+
+    @cached_property
+    def _structure(self) -> Structure:
+        return Structure.of(self.observations, self.free.poses)
 
     def _of_marks(self, state: _State) -> ImageEquations | None:
         if (marks := self.priors.marks) is None:

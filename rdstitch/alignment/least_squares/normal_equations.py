@@ -168,12 +168,41 @@ class ImageEquations:
         np.add.at(gradient, (link[:, None], column), np.einsum("mip,mi->mp", weighted, self.errors[chosen]))
 
 
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """Which images the links couple: the same at every step."""
+
+    free: BoolArray  # (N, D): parameters of the poses that are estimated
+    joined: BoolArray  # (L,): links between images that are not fixed
+    elimination: Elimination  # of the images by these links
+    # some links at a time; of their first and of their second images which these are, and what sums over each one's
+    sums: tuple[tuple[slice, tuple[tuple[IntArray, "sparse.csr_array"], ...]], ...]
+
+    @classmethod
+    def of(cls, observations: Observations, free: BoolArray) -> Self:
+        """By the images of the links."""
+        image1, image2, moving = observations.image1, observations.image2, free.any(axis=1)
+        joined = moving[image1] & moving[image2]
+        starts = range(0, len(observations), _LINKS_AT_ONCE)
+        parts = [slice(first, min(first + _LINKS_AT_ONCE, len(observations))) for first in starts]
+        sums = tuple((links, (_sums(image1[links]), _sums(image2[links]))) for links in parts)
+        return cls(free, joined, Elimination.of_links(len(free), image1[joined], image2[joined]), sums)
+
+
+def _sums(images: IntArray) -> tuple[IntArray, "sparse.csr_array"]:
+    """The images of some links (l,), each once, and the matrix that sums rows of the links for each of them."""
+    order = np.argsort(images, kind="stable")
+    found, first = np.unique(images[order], return_index=True)
+    shape = len(found), len(images)
+    return found, sparse.csr_array((np.ones(len(images)), order, np.append(first, len(images))), shape)
+
+
 def assemble(
     equations: LinkEquations,
     observations: Observations,
     model: ModelMatrices,
     homographies: FloatArray,
-    free: BoolArray,
+    structure: Structure,
     weight: float,
     marks: ImageEquations | None = None,
 ) -> SparseNormalEquations:
@@ -183,11 +212,11 @@ def assemble(
     ``marks`` in single images show comes besides.
     """
     size, others = model.by_pose.shape[1], model.by_shared.shape[1] + equations.gram.shape[1] - 9
-    pair, count = 2 * size, len(free)
-    by_image, of_links = np.zeros((count, size * (size + others + 1))), np.empty((len(observations), size, size))
+    free, pair = structure.free, 2 * size
+    by_image = np.zeros((len(free), size * (size + others + 1)))
+    of_links = np.empty((len(observations), size, size))
     shared, gradient_shared = np.zeros((others, others)), np.zeros(others)
-    for first in range(0, len(observations), _LINKS_AT_ONCE):
-        links = slice(first, min(first + _LINKS_AT_ONCE, len(observations)))
+    for links, (sums1, sums2) in structure.sums:
         derivative = link_derivatives(observations, model, homographies, equations.gram.shape[1] - 9, links)
         local = np.swapaxes(derivative, 1, 2) @ equations.gram[links] @ derivative * weight
         gradient = np.einsum("lpk,lp->lk", derivative, equations.gradient[links]) * weight
@@ -197,25 +226,19 @@ def assemble(
         moving = np.concatenate([free[images[0]], free[images[1]], np.ones((len(local), others))], axis=1)
         local, gradient = local * moving[:, :, None] * moving[:, None, :], gradient * moving
         of_links[links] = local[:, size:pair, :size]
-        for of, of_pose in zip(images, (slice(size), slice(size, pair)), strict=True):
+        for (present, sums), of_pose in ((sums1, slice(size)), (sums2, slice(size, pair))):
             # One row for each image: its block, its rows of the coupling, and its gradient.
             rows = np.concatenate(
                 [local[:, of_pose, of_pose], local[:, of_pose, pair:], gradient[:, of_pose, None]], axis=2
             )
-            # Summed over the links of each image.
-            order = np.argsort(of, kind="stable")
-            present, first_link = np.unique(of[order], return_index=True)
-            sums = sparse.csr_array((np.ones(len(of)), order, np.append(first_link, len(of))), (len(present), len(of)))
             by_image[present] += sums @ rows.reshape(len(rows), -1)
         shared += local[:, pair:, pair:].sum(axis=0)
         gradient_shared += gradient[:, pair:].sum(axis=0)
-    poses, coupling, gradient_poses = np.split(by_image.reshape(count, size, -1), [size, size + others], axis=2)
-    gradient_poses = gradient_poses[:, :, 0]
-    moving = np.flatnonzero(free.any(axis=1))
-    joined = np.isin(observations.image1, moving) & np.isin(observations.image2, moving)
-    elimination = Elimination.of_links(count, observations.image1[joined], observations.image2[joined])
+    blocks = by_image.reshape(len(free), size, -1)
+    poses, coupling, gradient_poses = np.split(blocks, [size, size + others], axis=2)
+    of_joined = of_links[structure.joined]
     return SparseNormalEquations(
-        elimination, free, poses, of_links[joined], coupling, shared, gradient_poses, gradient_shared
+        structure.elimination, free, poses, of_joined, coupling, shared, gradient_poses[:, :, 0], gradient_shared
     )
 
 

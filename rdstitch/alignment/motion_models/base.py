@@ -63,7 +63,11 @@ class MotionModel(ABC):
 
     def focal(self, shared: FloatArray) -> float:
         """Focal length of the one camera, half diagonals."""
-        return float(np.exp(shared[-1]))
+        return float(np.exp(self.log_focal(shared)))
+
+    def log_focal(self, shared: FloatArray) -> float:
+        """Logarithm of it, the last of the shared parameters."""
+        return float(shared[-1])
 
     @abstractmethod
     def shared_starts(self, log_focal: float, tilt: Sequence[float], *, tilt_known: bool) -> list[FloatArray]:

@@ -46,9 +46,9 @@ class RotationModel(MotionModel):
         """The focal length that is known, and a range of others."""
         return [np.array([each]) for each in (log_focal, *_FOCAL_STARTS)]
 
-    def focal(self, shared: FloatArray) -> float:
-        """Focal length, half diagonals, within what a lens can have."""
-        return float(np.exp(np.clip(shared[0], *_LOG_FOCAL_LIMITS)))
+    def log_focal(self, shared: FloatArray) -> float:
+        """Logarithm of the focal length, within what a lens can have."""
+        return float(np.clip(shared[0], *_LOG_FOCAL_LIMITS))
 
     def retract(self, poses: FloatArray, step: FloatArray) -> FloatArray:
         """Poses after a step of shape (N, 3), radians."""

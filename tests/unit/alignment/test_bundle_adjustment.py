@@ -6,7 +6,7 @@ import pytest
 from examples.worlds.alignment_scenes import Scene, grid_scene
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, FreeParameters, Parameters
 from rdstitch.alignment.least_squares.link_equations import link_equations, squared_lengths, trial_errors
-from rdstitch.alignment.least_squares.normal_equations import SparseNormalEquations, assemble
+from rdstitch.alignment.least_squares.normal_equations import SparseNormalEquations, Structure, assemble
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, MotionModel
@@ -58,7 +58,8 @@ def test_gradient_and_curvature_of_the_whole_cost(model: MotionModel, width: flo
     free = np.ones((count, model.pose_size), dtype=np.bool_)
     free[0] = False
     matrices = model.matrices(start.poses, start.shared)
-    normal = assemble(equations, observations, matrices, homographies(start), free, 2.0)
+    structure = Structure.of(observations, free)
+    normal = assemble(equations, observations, matrices, homographies(start), structure, 2.0)
 
     def cost(poses_step: np.ndarray, shared_step: np.ndarray) -> float:
         moved = start.retract(model, poses_step, shared_step, FREE_LENS)
@@ -114,7 +115,7 @@ def test_information_on_shared_parameters_is_what_elimination_leaves() -> None:
         observations,
         matrices,
         h,
-        free,
+        Structure.of(observations, free),
         1.0,
     )
     normal = normal.with_priors(np.full(free.shape, 1e4), np.zeros(free.shape), np.eye(4), np.zeros(4))

@@ -1,5 +1,6 @@
 """Vanishing points, rectangles, and how much straightening may cut away."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -106,7 +107,7 @@ def test_no_straightening_that_cuts_most_away(projection: Any, done: bool, monke
     lens = Camera((400, 300), 0.0, focal=260.0)
     looks = np.stack([camera_rotations(yaw, 0.0, 0.0)[0] for yaw in (-0.3, 0.0, 0.3)])
     directions = np.swapaxes(looks, 1, 2) @ np.diag([1.0, 1.0, 260.0 / lens.scale])
-    placed = PlacedImages([source(f"{k}.jpg") for k in range(3)], [lens] * 3, directions, 1, turned=True)
+    placed = PlacedImages([replace(source(f"{k}.jpg"), camera=lens) for k in range(3)], directions, 1, turned=True)
     upwards = straighten.view_rotation(CompositeOptions(pitch=-50.0))
     monkeypatch.setattr(straighten, "_upright", lambda placed, options: (upwards, []))
     options = CompositeOptions(straighten="auto", projection=projection)

@@ -279,6 +279,23 @@ def test_hugin_means_what_its_manual_says(tmp_path: Path, camera: Camera, projec
     assert 0.3 * stated < apart < 1.05 * stated + 1e-6
 
 
+@pytest.mark.parametrize(("projection", "view"), [(2, 190.0), (3, 200.0)])
+def test_hugins_fisheyes_see_more_than_half_of_all(tmp_path: Path, projection: int, view: float) -> None:
+    (tmp_path / "c.pto").write_text(f'i w2000 h2000 f{projection} v{view} a0 b0 c0 d0 e0 n"a.jpg"\n', encoding="utf-8")
+    camera = load_camera(tmp_path / "c.pto")
+    assert camera.focal == pytest.approx(1000.0 / np.radians(view / 2))
+    # An equidistant fisheye: a ray 60 degrees off the axis is measured at 60/(v/2) of the way to the border.
+    straight = camera.center + np.array([[camera.focal * np.tan(np.radians(60.0)), 0.0]])
+    seen = (camera.lens_model or camera).distort(straight)
+    np.testing.assert_allclose(seen - camera.center, [[1000.0 * 60.0 / (view / 2), 0.0]], atol=0.1)
+
+
+def test_hugins_rectilinear_lenses_see_less_than_half_of_all(tmp_path: Path) -> None:
+    (tmp_path / "c.pto").write_text('i w2000 h2000 f0 v190 n"a.jpg"\n', encoding="utf-8")
+    with pytest.raises(InputError, match="v: a rectilinear lens sees less than 180 degrees"):
+        load_camera(tmp_path / "c.pto")
+
+
 def test_opendronemap_of_others(tmp_path: Path) -> None:
     entry = {"projection_type": "perspective", "width": 4000, "height": 3000, "focal": 0.85, "k1": -0.02, "k2": 0.004}
     file = tmp_path / "cameras.json"
@@ -292,6 +309,33 @@ def test_opendronemap_of_others(tmp_path: Path) -> None:
     file.write_text(json.dumps({"one": entry, "two": entry}), encoding="utf-8")
     with pytest.raises(InputError, match="2 cameras"):
         load_camera(file)
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters"),
+    [
+        ("SIMPLE_DIVISION", [1500.0, 810.5, 590.5, -0.2]),
+        ("DIVISION", [1500.0, 1500.0, 810.5, 590.5, 0.1]),
+        ("SIMPLE_FISHEYE", [900.0, 810.5, 590.5]),
+        ("FISHEYE", [900.0, 905.0, 810.5, 590.5]),
+    ],
+)
+def test_cameras_of_colmap_4_mean_what_it_says(tmp_path: Path, model: str, parameters: list[float]) -> None:
+    pycolmap = pytest.importorskip("pycolmap", "4.0")
+    numbers = " ".join(map(repr, parameters))
+    (tmp_path / "cameras.txt").write_text(f"1 {model} 1600 1200 {numbers}\n", encoding="utf-8")
+    camera = load_camera(tmp_path / "cameras.txt")
+    lens, points = camera.lens_model or camera, _points(camera)
+    theirs = pycolmap.Camera(model=model, width=1600, height=1200, params=parameters).cam_from_img(points + 0.5)
+    # What is within 1/32 pixel of a division model is read as that.
+    tolerance = 1e-6 if "DIVISION" in model else 1.0 / 32.0
+    np.testing.assert_allclose(lens.distort(theirs * camera.focal + camera.center), points, atol=tolerance)
+
+
+def test_a_division_model_of_colmap_has_square_pixels(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 DIVISION 1600 1200 1500 1510 810.5 590.5 -0.2\n", encoding="utf-8")
+    with pytest.raises(InputError, match="needs one focal length"):
+        load_camera(tmp_path / "cameras.txt")
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,8 @@
 """The place of a mosaic on the Earth, from made-up positions."""
 
 import csv
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,21 +22,23 @@ from rdstitch.geometry.crs import Crs
 from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.georeferencing.camera_views import views_of
-from rdstitch.georeferencing.georeference import Georeference, map_summary, world_file_paths
+from rdstitch.georeferencing.georeference import Georeference, Residual, map_summary, world_file_paths
 from rdstitch.georeferencing.map_grid import MapGrid
-from rdstitch.georeferencing.place_on_map import Located, place_on_map
+from rdstitch.georeferencing.place_on_map import AlignmentErrors, place_on_map
+from rdstitch.inputs.delays import MeasuredTilt
 from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.io import ImageSpec, write_strips
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.map_canvas import plan_on_map
+from rdstitch.pipeline.output_messages import place_messages
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.report import report_page
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.robust.similarity_fit import fit_similarity
 from rdstitch.synthetic.poses import Poses
 from tests.cli.running import DISTORTION, flight, sidecar_of, transfers
-from tests.registrations import registration, stitched
+from tests.registrations import CAMERA, registration, source, stitched
 
 
 def _degrees(value: float) -> tuple[float, float, float]:
@@ -181,39 +184,52 @@ def test_files_beside_are_kept(located: tuple[list[Path], FloatArray], cached: S
     assert [(file.name, file.read_text(encoding="ascii")) for file in tmp_path.iterdir()] == [("a.prj", "mine")]
 
 
-def _row(count: int) -> Located:
+@dataclass(frozen=True)
+class _Flight:
+    """Images, by their positions and where they lie in the output."""
+
+    positions: Sequence[GpsPosition | None]
+    to_output: FloatArray
+    camera: Camera = CAMERA
+    control: Sequence[Sequence[GroundControl]] | None = None
+    attitude: MeasuredTilt | None = None
+
+    def place(self, epsg: int | None = None, *, force: bool = False) -> tuple[Georeference | None, str]:
+        taken = [source(f"{k}.jpg", gps=position) for k, position in enumerate(self.positions)]
+        control = self.control or [()] * len(taken)
+        sources = [
+            replace(each, camera=self.camera, control=tuple(points), attitude=self.attitude)
+            for each, points in zip(taken, control, strict=True)
+        ]
+        return place_on_map(sources, self.to_output, AlignmentErrors(), epsg, force=force)
+
+
+def _row(count: int) -> _Flight:
     """Positions 7 m apart along a parallel, and images that lie along a curve."""
     to_output = np.stack([np.array([[250.0, 0, 300 * k], [0, 250.0, 4 * k**2], [0, 0, 1]]) for k in range(count)])
-    return Located(
-        [GpsPosition(50.0, 8.0 + 1e-4 * k) for k in range(count)],
-        [Camera((400, 300))] * count,
-        to_output,
-        [f"{k}.jpg" for k in range(count)],
-        [None] * count,
-        [()] * count,
-    )
+    return _Flight([GpsPosition(50.0, 8.0 + 1e-4 * k) for k in range(count)], to_output)
 
 
 def test_positions_that_do_not_fit_are_refused() -> None:
     row = _row(8)
-    place, reason = place_on_map(row)
+    place, reason = row.place()
     assert place is not None
     assert reason == ""
     assert "the image centres" in place.assumption
     mixed = replace(row, positions=[row.positions[k] for k in (4, 0, 7, 2, 5, 1, 6, 3)])
-    place, reason = place_on_map(mixed)
+    place, reason = mixed.place()
     assert place is None
     assert "the GPS positions contradict the images" in reason
-    place, again = place_on_map(mixed, force=True)
+    place, again = mixed.place(force=True)
     assert place is not None
     assert again.partition(";")[0] == reason.partition(";")[0]
-    place, reason = place_on_map(replace(row, positions=[*row.positions[:2], *[None] * 6]))
+    place, reason = replace(row, positions=[*row.positions[:2], *[None] * 6]).place()
     assert place is None
     assert reason == "2 of 8 images have a GPS position, and 3 are needed"
-    place, reason = place_on_map(replace(row, positions=[row.positions[0]] * 8))
+    place, reason = replace(row, positions=[row.positions[0]] * 8).place()
     assert (place, reason) == (None, "all images have the same GPS position")
     in_one_place = replace(row, to_output=np.tile(row.to_output[:1], (8, 1, 1)))
-    place, reason = place_on_map(in_one_place, force=True)
+    place, reason = in_one_place.place(force=True)
     assert place is None
     assert "no scale and direction of the map fit the GPS positions" in reason
 
@@ -222,39 +238,64 @@ def test_positions_that_do_not_fit_are_refused() -> None:
 def test_one_bad_position_of_eight_is_named_and_left_out(wrong: GpsPosition, off: float) -> None:
     row = _row(8)
     before, after = row.positions[:4], row.positions[5:]
-    whole, _ = place_on_map(replace(row, positions=[*before, None, *after]))
-    place, _ = place_on_map(replace(row, positions=[*before, wrong, *after]))
+    whole, _ = replace(row, positions=[*before, None, *after]).place()
+    place, _ = replace(row, positions=[*before, wrong, *after]).place()
     assert (place.used, len(place.residuals)) == (7, 8)
-    ((name, away),) = place.rejected
-    assert name == "4.jpg"
-    assert away == pytest.approx(off, rel=0.2)
+    (rejected,) = place.rejected
+    assert rejected.name == "4.jpg"
+    assert rejected.distance == pytest.approx(off, rel=0.2)
     corner = [(0.0, 0.0)]
     np.testing.assert_allclose(place.to_map(corner), whole.to_map(corner), atol=0.1)
+
+
+def test_an_attitude_of_a_table_says_what_is_below_a_camera() -> None:
+    """With a homography for each image: of 5 degrees, 33 pixels of 380 beside the middle."""
+    camera, sheared = Camera((400, 300), focal=380.0, focal_source="option"), _row(8).to_output.copy()
+    sheared[:, 0, 1] = 1.0
+    row = replace(_row(8), to_output=sheared, camera=camera)
+    tilted = replace(row, attitude=MeasuredTilt((np.radians(5.0), 0.0)))
+    plain, _ = row.place()
+    place, _ = tilted.place()
+    assert plain.assumption
+    assert not place.assumption
+    moved = (plain.origin - place.origin) / place.scale
+    assert abs(moved.imag) == pytest.approx(380.0 * np.tan(np.radians(5.0)), rel=0.01)
+    assert abs(moved.real) < 0.2
+
+
+def test_what_lies_beyond_the_horizon_has_no_residual() -> None:
+    row = _row(8)
+    row.to_output[4] *= -1.0
+    place, _ = row.place()
+    assert place.rejected == (Residual("4.jpg", None, None, used=False),)
+    texts = [message.text for message in place_messages(place, "", stitched(registration()).placed)]
+    assert "GPS positions that have no place in the output were not used: 4.jpg" in texts
 
 
 def test_control_points_place_the_output_instead_of_positions() -> None:
     """A point in two images counts once; one that is 2 m off is named; the system is that of the list."""
     row = _row(8)
-    truth = Georeference(Crs(32632), 0.05 * np.exp(0.2j), complex(448_000.0, 5_500_000.0), 0.0)
-    control: list[list[GroundControl]] = [[] for _ in row.names]
+    truth = Georeference(Crs(32632), 0.05 * np.exp(0.2j), complex(448_000.0, 5_500_000.0))
+    control: list[list[GroundControl]] = [[] for _ in row.positions]
     for number, (x, y) in enumerate(
         [(40.0, 90.0), (330.0, -80.0), (900.0, 70.0), (1000.0, 10.0), (1500.0, 130.0), (2100.0, 90.0)]
     ):
         ((east, north),) = truth.to_map([(x, y)]) + (2.0 if number == 4 else 0.0)
         latitude, longitude = Crs(32632).geographic([(east, north)])[0]
         for image in range(int(x // 300), int(x // 300) + 1 + (number == 1)):
-            u, v = from_plane(row.cameras[image], row.to_output[image], np.array([(x, y)]))[0]
+            u, v = from_plane(row.camera, row.to_output[image], np.array([(x, y)]))[0]
             control[image].append(GroundControl(f"P{number}", GpsPosition(latitude, longitude), 32632, (u, v)))
-    place, _ = place_on_map(replace(row, control=control))
+    place, _ = replace(row, control=control).place()
     assert (place.crs, place.source, place.used) == (Crs(32632), "ground control points", 5)
-    assert [name for name, _ in place.rejected] == ["P4"]
-    assert place.rejected[0][1] == pytest.approx(2.0 * 2**0.5, rel=0.01)
+    (rejected,) = place.rejected
+    assert rejected.name == "P4"
+    assert rejected.distance == pytest.approx(2.0 * 2**0.5, rel=0.01)
     np.testing.assert_allclose(
         place.to_map([(0.0, 0.0), (2000.0, 300.0)]), truth.to_map([(0, 0), (2000, 300)]), atol=0.01
     )
-    assert max(r.off for r in place.residuals if r.used) < 0.01
+    assert max(r.distance for r in place.residuals if r.used) < 0.01
     few = [points if k < 2 else [] for k, points in enumerate(control)]
-    assert place_on_map(replace(row, control=few))[1] == ("2 ground control points are in the images, and 3 are needed")
+    assert replace(row, control=few).place()[1] == ("2 ground control points are in the images, and 3 are needed")
 
 
 @pytest.mark.parametrize(
@@ -316,7 +357,7 @@ def test_the_map_of_places_all_round_the_world(latitude: float, longitude: list[
 
 def test_the_ground_sample_distance_is_that_on_the_ground() -> None:
     row = _row(8)
-    utm_map, web = (place_on_map(row, epsg)[0] for epsg in (32632, 3857))
+    utm_map, web = (row.place(epsg)[0] for epsg in (32632, 3857))
     assert web.gsd == pytest.approx(utm_map.gsd, rel=0.005)
     assert abs(web.scale) == pytest.approx(utm_map.gsd / np.cos(np.radians(50.0)), rel=0.005)
     other = utm_map.in_system(Crs(3857), [(0.0, 0.0), (2000.0, 100.0), (0.0, 300.0)])
@@ -334,7 +375,7 @@ def test_pixels_that_stay_keep_their_place(scale: complex) -> None:
 
 
 def test_a_part_of_a_grid_whose_south_is_up_has_the_same_pixels() -> None:
-    grid = MapGrid((100, 80), Georeference(Crs(32632), -0.5 + 0.0j, 400_000.0 + 5_000_000.0j, 0.0))
+    grid = MapGrid((100, 80), Georeference(Crs(32632), -0.5 + 0.0j, 400_000.0 + 5_000_000.0j))
     part = grid.within((399_960.25, 5_000_009.75, 399_990.25, 5_000_030.25))
     assert (part.size, part.place.scale) == ((60, 41), grid.place.scale)
     np.testing.assert_allclose(part.place.to_map([(0.0, 0.0)]), [(399_990.0, 5_000_010.0)])
@@ -374,11 +415,11 @@ def test_an_image_beyond_the_horizon_leaves_the_others_their_pixel() -> None:
 
 def _survey(
     seed: int, tilt: tuple[float, float], yaw: float, std: float, slope: float = 0.0, altitude_std: float | None = None
-) -> tuple[Located, Georeference]:
+) -> tuple[_Flight, Georeference]:
     """20 cameras 40 m up, of one tilt and yaws within ``yaw``, and the right place of their output."""
     rng = np.random.default_rng(seed)
     camera = Camera((480, 360), focal=400.0, focal_source="estimate", focal_std=0.4, tilt=tilt, tilt_std=(1e-4, 1e-4))
-    truth = Georeference(Crs(32733), 0.1 * np.exp(0.3j), complex(500_000.0, 7_000_000.0), 0.0)
+    truth = Georeference(Crs(32733), 0.1 * np.exp(0.3j), complex(500_000.0, 7_000_000.0))
     across, along = np.meshgrid(np.arange(5) * 150.0, np.arange(4) * 150.0)
     feet = np.stack([across.ravel(), along.ravel()], axis=1) + rng.normal(0.0, 10.0, (20, 2))
     heights = rng.normal(400.0, 8.0, 20)
@@ -392,15 +433,14 @@ def _survey(
     altitude = up if altitude_std is None else up + rng.normal(0.0, altitude_std, 20)
     known = altitude.tolist() if altitude_std is not None else [None] * 20
     positions = [GpsPosition(y, x, above) for (y, x), above in zip(degrees.tolist(), known, strict=True)]
-    names = [f"{k}.jpg" for k in range(20)]
-    return Located(positions, [camera] * 20, to_output, names, [None] * 20, [()] * 20), truth
+    return _Flight(positions, to_output, camera), truth
 
 
 @pytest.mark.parametrize(("yaw", "slope", "altitude_std"), [(0.0, 0.0, None), (3.0, 0.0, 3.0), (0.0, 0.05, 0.03)])
 def test_positions_are_those_of_cameras(yaw: float, slope: float, altitude_std: float | None) -> None:
     """Image centres are 5.6 m from what is below a camera pitched by 8 degrees, and those of sloping ground 2 m."""
-    located, truth = _survey(1, (-0.14, 0.0), yaw, 0.02, slope, altitude_std)
-    place, _ = place_on_map(located)
+    flown, truth = _survey(1, (-0.14, 0.0), yaw, 0.02, slope, altitude_std)
+    place, _ = flown.place()
     corners = [(-100.0, -100.0), (700.0, 600.0), (300.0, 300.0)]
     assert np.hypot(*(place.to_map(corners) - truth.to_map(corners)).T).max() < 0.1
     assert place.rms < 0.04
@@ -413,8 +453,8 @@ def test_the_error_of_the_map_is_as_large_as_told(std: float) -> None:
     middle_of_field = [(300.0, 225.0)]
     errors = []
     for seed in range(40):
-        located, truth = _survey(seed, (-0.05, 0.03), 3.0, std, altitude_std=2 * std)
-        place, _ = place_on_map(located)
+        flown, truth = _survey(seed, (-0.05, 0.03), 3.0, std, altitude_std=2 * std)
+        place, _ = flown.place()
         errors.append((place.to_map(middle_of_field) - truth.to_map(middle_of_field)) / place.std)
     assert 0.4 < np.mean(np.square(errors)) < 2.0
     assert np.abs(errors).max() < 5.0
@@ -532,6 +572,6 @@ def test_a_strip_that_drifts_bends_back_onto_its_control_points(tmp_path: Path) 
 
     seen = [to_plane(alignment.cameras[k], alignment.homographies[k], pixels[k : k + 1])[0] for k in range(14)]
     fit = fit_similarity(np.array(seen) @ [1.0, -1.0j], places @ [1.0, 1.0j], 1e3)
-    without, checks = fit.residuals[1::3], np.array([check.off for check in held.georeference.checks])
+    without, checks = fit.residuals[1::3], np.array([check.distance for check in held.georeference.checks])
     assert np.sqrt(np.mean(checks**2)) < 0.5 * np.sqrt(np.mean(without**2))
     assert np.sqrt(np.mean(checks**2)) < 3.0 * held.georeference.rms

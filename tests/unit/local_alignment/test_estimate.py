@@ -18,7 +18,7 @@ from rdstitch.geometry.radial_homography import RadialHomography, from_direction
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source
 from rdstitch.io import DecodedImage, Metadata
-from rdstitch.local_alignment import DisplacementField, LocalAlignment, Match, align_locally, estimate, fit
+from rdstitch.local_alignment import DisplacementField, LocalAlignment, PutativeMatches, align_locally, estimate, fit
 from rdstitch.local_alignment.estimate import _agreement_of_neighbours
 from rdstitch.local_alignment.field import grid_shape, node_points
 from rdstitch.local_alignment.fit import Stiffness, fit_fields
@@ -120,7 +120,7 @@ def centers(sequence: Sequence) -> FloatArray:
     return np.column_stack([sequence.poses.position, sequence.poses.height - level])
 
 
-def matches(sequence: Sequence, noise: float = 0.2, wrong: float = 0.0, count: int = 400) -> list[Match]:
+def matches(sequence: Sequence, noise: float = 0.2, wrong: float = 0.0, count: int = 400) -> list[PutativeMatches]:
     """Matches of all pairs that overlap, with noise and a share of wrong ones among them."""
     rng = np.random.default_rng(3)
     found = []
@@ -134,7 +134,7 @@ def matches(sequence: Sequence, noise: float = 0.2, wrong: float = 0.0, count: i
             first, second = first[seen], second[seen] + rng.normal(0.0, noise, (int(seen.sum()), 2))
             lost = rng.random(len(second)) < wrong
             second[lost] += rng.uniform(-20.0, 20.0, (int(lost.sum()), 2))
-            found.append(Match(i, j, first, second))
+            found.append(PutativeMatches(i, j, first, second))
     return found
 
 
@@ -253,7 +253,7 @@ def test_on_a_plane_nothing_is_moved(noise: float) -> None:
     assert local.before is None  # what neighbours have nothing of in common needs no fit
 
 
-def tracked(sequence: Sequence, noise: float, seed: int, warp: float) -> list[Match]:
+def tracked(sequence: Sequence, noise: float, seed: int, warp: float) -> list[PutativeMatches]:
     """Matches of 101 points of the ground, each with one keypoint in every view, that smooth waves displace."""
     rng = np.random.default_rng(seed)
     ground = sequence.to_ground(len(sequence) // 2, rng.uniform((0, 0), (639, 479), (101, 2)))
@@ -264,7 +264,7 @@ def tracked(sequence: Sequence, noise: float, seed: int, warp: float) -> list[Ma
         points += warp * np.sqrt(2.0) * np.sin(points[:, ::-1] / 90.0 + phase[k])
         views.append((points + rng.normal(0.0, noise, points.shape), seen))
     pairs = [(i, j, views[i][1] & views[j][1]) for i in range(len(views)) for j in range(i + 1, len(views))]
-    return [Match(i, j, views[i][0][both], views[j][0][both]) for i, j, both in pairs if both.sum() > 12]
+    return [PutativeMatches(i, j, views[i][0][both], views[j][0][both]) for i, j, both in pairs if both.sum() > 12]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -285,7 +285,7 @@ def test_a_track_of_most_matches_is_not_held_out(others: int) -> None:
     rng = np.random.default_rng(1)
     one = np.full((100, 2), 240.0)
     joined, free = one + rng.uniform(-9.0, 9.0, one.shape), rng.uniform((0, 0), (639, 479), (others, 2))
-    given = [Match(0, 1, np.concatenate([joined, free]), np.concatenate([one, free]))]
+    given = [PutativeMatches(0, 1, np.concatenate([joined, free]), np.concatenate([one, free]))]
     local = align_locally(given, CAMERAS[:2], np.tile(np.eye(3), (2, 1, 1)), 7)
     assert bool(local.fields) == (others == 30)
     assert local.fields or "too few tracks" in local.reason
@@ -356,7 +356,7 @@ def test_nodes_that_no_match_supports_are_solved_as_exactly_as_others(
 def test_nothing_folds_even_where_matches_say_so() -> None:
     sequence = scene(None)
     torn = [
-        Match(m.image1, m.image2, m.points1, m.points2 + 14.0 * np.sign(np.sin(m.points2[:, ::-1] / 15.0)))
+        PutativeMatches(m.image1, m.image2, m.points1, m.points2 + 14.0 * np.sign(np.sin(m.points2[:, ::-1] / 15.0)))
         for m in matches(sequence, count=1000)
     ]
     images = ImagesOnSurface.of(CAMERAS, homographies(sequence))
@@ -417,7 +417,7 @@ def test_of_very_many_matches_an_even_part_is_enough(monkeypatch: pytest.MonkeyP
 
 def test_too_few_matches_are_said() -> None:
     sequence = scene(None)
-    few = [Match(m.image1, m.image2, m.points1[:9], m.points2[:9]) for m in matches(sequence)[:2]]
+    few = [PutativeMatches(m.image1, m.image2, m.points1[:9], m.points2[:9]) for m in matches(sequence)[:2]]
     assert align_locally(few, CAMERAS, homographies(sequence)).reason == "there are too few matches"
 
 
@@ -428,7 +428,7 @@ def test_images_beyond_the_horizon_are_nowhere() -> None:
     assert align_locally(matches(scene(None)), CAMERAS, nowhere).reason == "there are too few matches"
 
 
-def turn(step: float) -> tuple[list[Match], FloatArray, list[FloatArray]]:
+def turn(step: float) -> tuple[list[PutativeMatches], FloatArray, list[FloatArray]]:
     """Four images of hills about ten away; between them the camera turned by 25 degrees and moved by ``step``."""
     rng = np.random.default_rng(5)
     angles = np.radians(25.0) * np.arange(4)
@@ -448,7 +448,7 @@ def turn(step: float) -> tuple[list[Match], FloatArray, list[FloatArray]]:
         seen = np.isfinite(places[1]).all(axis=1) & ((places[1] >= 0) & (places[1] <= (639, 479))).all(axis=1)
         exact = np.stack([p[seen] for p in places])
         noisy = exact + rng.normal(0.0, 0.2, exact.shape)
-        found.append(Match(i, i + 1, *noisy))
+        found.append(PutativeMatches(i, i + 1, *noisy))
         first_and_second.append(exact)
     return found, matrices, first_and_second
 

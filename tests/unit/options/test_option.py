@@ -11,7 +11,7 @@ import pytest
 import rdstitch
 from rdstitch import Camera, CompositeOptions, FilesBeside, StitchOptions, TileOptions
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import Option, Options, declared, documented
+from rdstitch.options.option import Option, Options, Range, Unit, declared, documented
 
 
 @documented
@@ -19,8 +19,8 @@ from rdstitch.options.option import Option, Options, declared, documented
 class _Options(Options):
     """Some."""
 
-    number: Annotated[float, Option("A number.", above=0.0, most=10.0)] = 1.0
-    count: Annotated[int | Literal["auto"] | None, Option("How many.", least=2)] = None
+    number: Annotated[float, Option("A number.", within=Range(above=0.0, most=10.0))] = 1.0
+    count: Annotated[int | Literal["auto"] | None, Option("How many.", within=Range(least=2))] = None
     word: Annotated[Literal["one", "two", "three"], Option("A word.")] = "one"
     sides: Annotated[tuple[float, float] | None, Option("Two sides.")] = None
     lines: Annotated[Literal["off"] | tuple[tuple[float, float], ...], Option("Lines.")] = "off"
@@ -90,7 +90,7 @@ def test_angles_have_their_unit_for_each_reader() -> None:
         documentation = (StitchOptions.__doc__ or "").split(f"\n{name}\n")[1].splitlines()[0]
         assert "radians" in documentation
         assert "degrees" not in documentation
-        assert "degrees" in text.in_unit("degrees")
+        assert "degrees" in text.in_unit(Unit.DEGREES)
     for name in ("yaw", "pitch", "roll", "rotate"):
         assert "degrees" in (CompositeOptions.__doc__ or "").split(f"\n{name}\n")[1].splitlines()[0]
 
@@ -203,5 +203,10 @@ def test_files_beside_neither_change_the_reference_nor_are_forgotten(tmp_path: P
     with pytest.raises(ArgumentError, match="--map-server is made from the output"):
         rdstitch.mosaic(images, beside=FilesBeside(map_server=tmp_path / "map", height=1.0))
     for beside in (FilesBeside(poses=tmp_path / "p.csv"), FilesBeside(layers=tmp_path / "layers")):
-        with pytest.raises(ArgumentError, match="calibrate composites nothing: beside it there is a report only"):
+        with pytest.raises(ArgumentError, match=r"calibrate writes no (poses|layers): beside its result"):
             rdstitch.calibrate(images, beside=beside)
+    with pytest.raises(ArgumentError, match=r"tiles writes no map_server: .* hugin_project, layers, report"):
+        rdstitch.tiles(images, tmp_path / "a.tif", beside=FilesBeside(map_server=tmp_path / "map"))
+    for recipe in (rdstitch.calibrate, rdstitch.trajectory):
+        with pytest.raises(ArgumentError, match=f"{recipe.__name__} composites nothing: leave out dry_run"):
+            recipe(images, options=StitchOptions(dry_run=True))

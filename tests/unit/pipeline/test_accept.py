@@ -19,9 +19,10 @@ from rdstitch.matching.links import Link
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.accept import accept
-from rdstitch.pipeline.aligner import AlignedPairs, Aligner, reselect_inliers, select_by_whole_lens
+from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.pipeline.realign import realigned, without
 from rdstitch.pipeline.recipes import mosaic
+from rdstitch.pipeline.redraft import reselect_inliers, select_by_whole_lens
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message, left_out
 from rdstitch.system.cache import NO_CACHE

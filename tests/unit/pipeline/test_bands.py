@@ -200,7 +200,7 @@ def test_the_grid_of_another_file(rig: Path, tmp_path: Path) -> None:
         apply(sidecar, files, options, CompositeOptions(like=str(tmp_path / "plain.tif")))
     keys = [(34735, 3, 5, (1, 1, 0, 1, 3072), True)]  # cut off
     tifffile.imwrite(tmp_path / "cut.tif", np.zeros((9, 9), dtype=np.uint8), extratags=keys)
-    with pytest.raises(InputError, match=r"cut\.tif: not an image that can be read"):
+    with pytest.raises(InputError, match=r"cut\.tif: is not a GeoTIFF"):
         read_grid(tmp_path / "cut.tif")
 
 

@@ -89,7 +89,7 @@ def test_where_heights_of_the_ground_explain_parallax_no_other_model_is_tried(by
     trials = _Trials(OPTIONS, False, lambda image: np.empty((0, 2, 2)))
     first = trials.lay_out(near, replace(no_local_alignment(""), by_heights=by_heights))
     assert first.faults
-    assert bool(list(_alternatives(near, [first], trials, aligner))) is not by_heights
+    assert bool(list(_alternatives(near, first, trials, aligner))) is not by_heights
 
 
 def test_what_a_homography_stretches_is_laid_out_as_a_turn(shared_data: Callable[[str], Path]) -> None:
@@ -115,7 +115,7 @@ def test_a_passing_vehicle_makes_no_turn_of_a_plane(tmp_path: Path) -> None:
 def test_a_plane_seen_from_the_sideis_stretched(tilt: float, stretched: bool) -> None:
     oblique = np.eye(3)
     oblique[2, 0] = tilt
-    placed = PlacedImages([source(), source()], [CAMERA] * 2, np.stack([np.eye(3), oblique]), 0)
+    placed = PlacedImages([source(), source()], np.stack([np.eye(3), oblique]), 0)
     assert is_stretched(CanvasPlan.of(placed, CompositeOptions())) is stretched
 
 

@@ -9,7 +9,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import transfer
 from rdstitch.robust import estimate_radial_homography
-from rdstitch.robust.chance import MIN_OCCUPIED_CELLS, occupied_cells, rejection_reason
+from rdstitch.robust.chance import MIN_OCCUPIED_CELLS, binomial_tail, occupied_cells, rejection_reason
 from rdstitch.robust.measurements import Measurements, checked_matches, padded_length
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.solvers.solutions import Solutions
@@ -141,6 +141,13 @@ def test_chance_is_that_of_a_wrong_match_near_its_place(matches: int, threshold:
         reason = rejection_reason(points, points, np.arange(matches) < count, (SIZE, SIZE), threshold)
         if count >= MIN_OCCUPIED_CELLS:
             assert (reason is None) is reliable, count
+
+
+@pytest.mark.parametrize(("trials", "probability"), [(1, 0.3), (50, 0.5), (4000, 0.011)])
+def test_chance_of_so_many_or_more(trials: int, probability: float) -> None:
+    least = np.unique(np.linspace(-1, trials, 40).astype(int))
+    tails = [binomial_tail(int(one), trials, probability) for one in least]
+    np.testing.assert_allclose(tails, binom.sf(least - 1, trials, probability), rtol=1e-9, atol=1e-290)
 
 
 def test_a_wide_threshold_is_taken_for_even_odds_at_most() -> None:

@@ -45,6 +45,11 @@ def test_arrays_of_any_library_with_positions() -> None:
     assert min(item.reads for item in lazy) > 0
 
 
+def test_a_lens_that_was_given_is_called_so() -> None:
+    _, registration = rdstitch.place_tiles(TILES, positions=STAGE.nominal, distortion=0.01)
+    assert registration.summary.endswith("λ = 0.0100 (given)")
+
+
 @pytest.mark.parametrize("places", [[[1, 2], [3]], [["a", "b"]] * 6, [[0, 0]] * 7, {"x": [1] * 6, "y": [1] * 5}])
 def test_positions_that_are_no_numbers_of_each_tile_are_refused(places: object) -> None:
     with pytest.raises(ArgumentError, match="numbers, x and y of each of 6 tiles"):

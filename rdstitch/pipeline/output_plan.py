@@ -1,0 +1,176 @@
+"""All files that a run writes: named and checked before its work, staged with its result."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Self
+
+from rdstitch.choices import TrajectoryFormat
+from rdstitch.errors import ArgumentError
+from rdstitch.export.layers import layer_files, stage_layers
+from rdstitch.export.map_server import check_map_server, map_files, write_map
+from rdstitch.export.poses_files import poses_file
+from rdstitch.export.write_trajectory import check_bag
+from rdstitch.georeferencing.georeference import world_file_paths
+from rdstitch.georeferencing.place_on_map import MIN_POSITIONS, has_place
+from rdstitch.inputs.source import Source
+from rdstitch.pipeline.run import Run
+from rdstitch.results.messages import Message
+from rdstitch.results.registration import Registration
+from rdstitch.results.stitch_result import StitchResult
+from rdstitch.system.output_checks import check_not_read, check_outputs, check_suffix
+from rdstitch.system.outputs import Outputs, text_bytes
+from rdstitch.viewer.page import viewer_path
+
+
+@dataclass(frozen=True)
+class FileBeside:
+    """What is written beside an image, which is kept where this fails."""
+
+    place: Path  # the file, or folder, that the user named
+    stage: Callable[[StitchResult], object]
+    in_folder: Sequence[Path] | None = None  # files in a folder, which is made where it is missing
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """All that is written."""
+        return [self.place] if self.in_folder is None else self.in_folder
+
+
+@dataclass(frozen=True)
+class OutputPlan:
+    """Every file that a run writes, and those that it reads."""
+
+    run: Run
+    read: Sequence[str | Path]
+    images: Sequence[Path] = ()
+    files: Sequence[Path] = ()  # besides the images and what belongs to these
+    beside: Sequence[FileBeside] = ()
+    replaced_bag: Path | None = None  # folder that another bag takes the place of
+
+    @classmethod
+    def of_images(
+        cls,
+        run: Run,
+        inputs: Iterable[str | Path],
+        names: Sequence[str] = (),
+        more_images: Sequence[Path] = (),
+        more_files: Sequence[Path] = (),
+    ) -> Self:
+        """Of a run over images of these names; ``more_images`` may follow its output."""
+        files = [*more_files, *_camera_file(run)]
+        images = [*([] if run.output is None else [run.output]), *more_images]
+        return cls(run, [*inputs, *run.read], images, files, list(_files_beside(run, names)))
+
+    @classmethod
+    def of_path(
+        cls,
+        run: Run,
+        inputs: Iterable[str | Path],
+        output: str | Path | None,
+        plot: str | Path | None,
+        file_format: TrajectoryFormat,
+    ) -> Self:
+        """Of a trajectory."""
+        files, replaced = [Path(file) for file in (output, plot) if file is not None], None
+        files += _camera_file(run)
+        if file_format == "bag" and output is not None:
+            check_bag(files[0], overwrite=run.options.overwrite)
+            if files[0].is_dir() and run.options.overwrite:  # as the bags of ROS 2 are
+                replaced = files.pop(0)
+        return cls(run, [*inputs, *run.read], files=files, replaced_bag=replaced)
+
+    def check(self) -> None:
+        """Find out before long work whether all can be written, over nothing read."""
+        outputs = self.run.outputs
+        for extra in self.beside:
+            if extra.in_folder is not None:
+                outputs.make_folder(extra.place)
+        of_images = [file for image in self.images for file in _image_files(check_suffix(image))]
+        beside = [file for extra in self.beside for file in extra.files]
+        check_outputs([*of_images, *self.files, *beside], outputs.overwrite, self.read)
+        check_not_read([] if self.replaced_bag is None else [self.replaced_bag], self.read)
+
+    def check_places(self, sources: Sequence[Source]) -> None:
+        """The same of files that place images on the Earth, once it is known whether there will be any."""
+        if has_place(sources):
+            files = [file for image in self.images for file in world_file_paths(image)]
+            check_outputs(files, self.run.outputs.overwrite)
+        elif self.run.beside.has_poses_on_map:
+            raise ArgumentError(
+                f"{self.run.beside.poses}: poses on the map need GPS positions of {MIN_POSITIONS} images, in EXIF or a "
+                "file, or ground control points; choose another --frame, or another name"
+            )
+
+    def stage(self, result: StitchResult) -> list[Message]:
+        """Stage what lies beside an image; a warning for each file that fails."""
+        attempts = (self.run.outputs.attempt(each.place, partial(each.stage, result)) for each in self.beside)
+        return [failure for failures in attempts for failure in failures]
+
+
+def stage_report(run: Run, result: Registration) -> list[Message]:
+    """Stage the report of what has no image, if one is wanted; a warning, where it fails."""
+    file = run.beside.report
+    return [] if file is None else run.outputs.attempt(file, partial(_write_report, run, file, result))
+
+
+def report_refused(run: Run, refused: Registration) -> None:
+    """Write the report of a result that is refused, so that one can see why; what fails then is not the reason."""
+    with Outputs(overwrite=True) as outputs:
+        stage_report(replace(run, outputs=outputs), refused)
+
+
+def _camera_file(run: Run) -> list[Path]:
+    """The camera file that is wanted, if any, of a format that there is."""
+    file = run.options.save_camera
+    if file is None:
+        return []
+    from rdstitch.camera_files import format_of  # with all formats, which most runs have no use for
+
+    format_of(file, run.options.camera_format)
+    return [file]
+
+
+def _image_files(output: Path) -> list[Path]:
+    """An image and what always belongs to it: the sidecar, and the page of a Deep Zoom image."""
+    page = viewer_path(output)
+    return [output, Path(f"{output}.json"), *([] if page is None else [page])]
+
+
+def _files_beside(run: Run, names: Sequence[str]) -> Iterator[FileBeside]:
+    """What is written beside an image of images with these names."""
+    beside, outputs = run.beside, run.outputs
+    if (report := beside.report) is not None:
+        yield FileBeside(report, partial(_write_report, run, report))
+    if (project := beside.hugin_project) is not None:
+        yield FileBeside(project, partial(_write_hugin_project, project, outputs))
+    if (table := beside.poses) is not None:
+        height = beside.height or 1.0
+
+        def write_poses(result: StitchResult) -> None:
+            outputs.write(table, text_bytes(poses_file(result, table, beside.frame, height)))
+
+        yield FileBeside(table, write_poses)
+    if (map_folder := beside.map_server) is not None:
+        check_map_server(run.output, beside.height)
+        write = partial(write_map, folder=map_folder, height=beside.height or 1.0, outputs=outputs)
+        yield FileBeside(map_folder, write, map_files(map_folder))
+    if beside.layers is not None:
+        layers = layer_files(names, beside.layers)
+        stage = partial(stage_layers, files=layers, outputs=outputs, whole=beside.whole_layers)
+        yield FileBeside(beside.layers, stage, [file for pair in layers.values() for file in pair])
+
+
+def _write_report(run: Run, file: Path, result: StitchResult | Registration) -> None:
+    # Imported late: most runs have none.
+    from rdstitch.report import write_report
+
+    write_report(file, result, run.progress.stages, run.beside.command, outputs=run.outputs)
+
+
+def _write_hugin_project(file: Path, outputs: Outputs, result: StitchResult) -> None:
+    # Imported late: most runs have none.
+    from rdstitch.export.hugin_project import project_of_hugin
+
+    outputs.write(file, text_bytes(project_of_hugin(result.registration, result.canvas)))
