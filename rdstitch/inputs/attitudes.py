@@ -40,7 +40,10 @@ def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list
     """
     if wanted is None:
         return list(sources)
-    return _of_images(sources) if wanted == XMP else _of_table(sources, wanted)
+    if wanted == XMP:
+        return _of_images(sources)
+    attitudes = _read_attitudes(wanted).of(sources)
+    return [replace(source, attitude=attitude) for source, attitude in zip(sources, attitudes, strict=True)]
 
 
 def _of_images(sources: Sequence[Source]) -> list[Source]:
@@ -64,12 +67,6 @@ def _of_images(sources: Sequence[Source]) -> list[Source]:
             f"{shortened(lacking)}: no attitude of the camera can be read from the XMP; give a CSV file instead"
         )
     return measured
-
-
-def _of_table(sources: Sequence[Source], file: str | Path) -> list[Source]:
-    """The sources with (ψ, θ), radians, of their lines, or of their times, and then at delays too."""
-    attitudes = _read_attitudes(file).of(sources)
-    return [replace(source, attitude=attitude) for source, attitude in zip(sources, attitudes, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)

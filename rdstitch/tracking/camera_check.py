@@ -1,4 +1,4 @@
-"""Whether keyframes agree with what is given of the camera: focal length, tilt, and the times of attitudes."""
+"""Check of what is given of the camera by keyframes: its focal length, its tilt, and the times of attitudes."""
 
 import math
 from dataclasses import dataclass, replace
@@ -20,9 +20,9 @@ _SURER = 0.5  # of the standard deviation of all lengths that earlier frames wer
 
 @dataclass(frozen=True)
 class CameraCheck:
-    """What the keyframes of a map show of a camera whose lens and focal length are given."""
+    """Judgement on a camera whose lens and focal length are given, by the keyframes of a map."""
 
-    knowledge: CameraKnowledge  # with that
+    knowledge: CameraKnowledge  # with what they show
     messages: list[Message]
     length_factor: float | None = None  # by which lengths change, as keyframes are placed anew; None: they stay
     focal_replaced: bool = False  # whether motions contradict the focal length, and with it alignments under way

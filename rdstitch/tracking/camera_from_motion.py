@@ -1,4 +1,4 @@
-"""What the motions between frames show of a camera whose lens is known: its tilt and focal length, and a delay."""
+"""Tilt, focal length and delay of attitudes of a camera whose lens is known, by the motions between frames."""
 
 import math
 from collections.abc import Sequence
@@ -31,13 +31,13 @@ class SeenPairs:
 
     @classmethod
     def of(cls, rays: Sequence[FloatArray], attitudes: Sequence[FloatArray]) -> "SeenPairs":
-        """From the rays (N, 2) of the one and the other frame of the first pair, of the second, and so on."""
+        """Pairs by the rays (N, 2) of the one and the other frame of the first pair, of the second, and so on."""
         chosen = [some[np.linspace(0, len(some) - 1, _POINTS).astype(np.intp)] for some in rays]
         measured = smooth(np.array([attitudes[::2], attitudes[1::2]])) if attitudes else None
         return cls(np.array([chosen[::2], chosen[1::2]]), measured, np.ones((len(chosen) // 2, _POINTS)))
 
     def errors(self, camera: FloatArray) -> FloatArray:
-        """How far (2 K M,) points on the plane are from a rigid motion, focal lengths; inf beyond the horizon.
+        """Errors (2 K M,) of points on the plane against a rigid motion, focal lengths; inf beyond the horizon.
 
         ``camera``: the tilt, the logarithm of how much longer the focal length is, and the delay.
         """
@@ -58,7 +58,7 @@ class SeenPairs:
         return np.concatenate([errors.real.ravel(), errors.imag.ravel()])
 
     def without_outliers(self, errors: FloatArray) -> "SeenPairs":
-        """Without the points whose errors, as above, are out of proportion to those of most."""
+        """The pairs without the points whose ``errors`` are out of proportion to those of most."""
         size = np.hypot(*errors.reshape(2, *self.weights.shape))
         good = size <= _OUTLIER * np.median(size)
         enough = good.sum(axis=1, keepdims=True) >= _POINTS / 2
@@ -67,7 +67,7 @@ class SeenPairs:
 
 @dataclass(frozen=True)
 class CameraEstimate:
-    """What motions show of a camera."""
+    """Camera as motions show it."""
 
     tilt_given_focal: tuple[float, float]  # (ψ, θ), radians, with the focal length that is given
     tilt_std: float  # of its less certain direction

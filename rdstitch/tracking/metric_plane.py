@@ -16,7 +16,7 @@ _CELLS = 8  # a side of an image: errors of one cell share a part that comes of 
 
 @dataclass(frozen=True)
 class MetricPlane:
-    """What a motion in the plane needs of the camera."""
+    """Focal length and tilt of a camera that moves over a plane."""
 
     focal: float  # half diagonals
     tilt: tuple[float, float]  # (ψ, θ), radians, of all frames, or of the mount of what measures attitudes

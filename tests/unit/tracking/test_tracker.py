@@ -320,7 +320,8 @@ def _keyframe(number: int, placement: Placement | None = None) -> TrackedFrame:
     """Of a camera with a given focal length, on a body that moves ahead."""
     camera = Camera((640, 480), -0.2, focal=1.3 * 400.0, focal_source="option")
     image = prepare(View(np.zeros((480, 640), dtype=np.uint8)), None)
-    frame = IncomingFrame(number, camera, image, MADE_UP.__getitem__, body=BodyPose(0.5 * number, 0.0, 0.0))
+    static, body = CornerFlow().static_places, BodyPose(0.5 * number, 0.0, 0.0)
+    frame = IncomingFrame(number, camera, image, MADE_UP.__getitem__, static, body=body)
     return TrackedFrame(frame, placement or _placed(number, 0.0, 0.0, 1.0), True, np.zeros((4, 4)), keyframe=True)
 
 
