@@ -11,7 +11,8 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.tracking.placement import HEIGHT, YAW, Placement, PlaneSimilarity, X, Y
 
-_CELLS = 8  # a side of an image: errors of one cell share a part that comes of the lens and the pixels of a place
+# A side of an image: errors of one cell share a part that comes of the lens and the pixels of a place; 4, 16: the same.
+_CELLS = 8
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,9 @@ from rdstitch.tracking.tracked_frame import IncomingFrame, TrackedFrame, Trackin
 from rdstitch.tracking.tracking_state import TrackingState
 
 _PATIENCE = 0.015  # seconds a frame that are waited for the first alignment
-_KEYFRAME_OVERLAP = 0.8  # fraction of a frame that its last keyframe shows, below which it becomes a keyframe
+# Fraction of a frame that its last keyframe shows, below which it becomes a keyframe; 0.7: 3.6 mm, and lengths are
+# known to 1.9 % instead of 0.4; 0.9: 3.1 mm, and 1.4 times the time.
+_KEYFRAME_OVERLAP = 0.8
 
 
 class FrameTracker:
