@@ -22,10 +22,12 @@ from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.register import register
 from rdstitch.pipeline.run import Run
+from rdstitch.results.messages import Severity
 from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.verification.evidence import ResultEvidence
+from rdstitch.verification.findings import Finding, Kind
 
 CAMERA = Camera((400, 300))
 
@@ -77,3 +79,8 @@ def evidence(
     found = ResultEvidence(given, threshold, purpose=purpose)
     vars(found).update(known)
     return found
+
+
+def finding(kind: Kind, images: tuple[int, ...] = (), severity: Severity = "failure") -> Finding:
+    """A finding of which nothing matters but its kind."""
+    return Finding(kind, severity, images, dict.fromkeys(kind.measured, 0))

@@ -32,7 +32,7 @@ def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callab
     def make(function: Callable[..., Any]) -> click.Command:
         @wraps(function)
         def run(*, quiet: bool, verbose: bool, **given: Any) -> Any:
-            _check_not_read(flags, given)
+            _check_configuration_is_kept(flags, given)
             try:
                 with Reporter(verbose - quiet) as reporter:
                     return function(reporter=reporter, **given)
@@ -134,16 +134,13 @@ class Flag(click.Option):
         self.declared = declared
 
 
-def _check_not_read(flags: Iterable[Flag], given: Mapping[str, Any]) -> None:
-    """Refuse to write over a file that an option names to be read, or over the configuration."""
-    from rdstitch.system.output_checks import check_not_read
-
-    named = [(flag.declared, given[str(flag.name)]) for flag in flags]
-    paths = [(option, path) for option, path in named if isinstance(path, Path)]
-    read = [path for option, path in paths if option.file is FileUse.READ]
+def _check_configuration_is_kept(flags: Iterable[Flag], given: Mapping[str, Any]) -> None:
+    """Refuse to write over the configuration, of which the library knows nothing."""
     if configuration := click.get_current_context().meta.get(CONFIG_FILE):
-        read.append(configuration)
-    check_not_read([path for option, path in paths if option.file is FileUse.WRITTEN], read)
+        from rdstitch.system.output_checks import check_not_read
+
+        written = [given[str(flag.name)] for flag in flags if flag.declared.file is FileUse.WRITTEN]
+        check_not_read([path for path in written if path is not None], [configuration])
 
 
 class FilePath(click.Path):

@@ -49,12 +49,12 @@ def overlaps(folder: Path, most: int) -> tuple[Pairs, Pairs]:
 def _row(name: str, right: Iterable[Agreement], wrong: Iterable[Agreement]) -> str:
     row = f"{name:22s}"
     for which, compared in (("right", right), ("wrong", wrong)):
-        known = [each for each in compared if each.cells >= Limits.min_cells]
-        cells = sum(each.cells for each in known)
-        unlike = [each.confirming_fraction < Limits.max_unlike_fraction for each in known]
-        agree, missed = sum(each.confirming for each in known) / max(cells, 1), sum(unlike)
+        known = [(each, fraction) for each in compared if (fraction := each.confirming_fraction) is not None]
+        cells = sum(each.cells for each, _ in known)
+        unlike = [fraction < Limits.max_unlike_fraction for _, fraction in known]
+        agree, missed = sum(each.confirming for each, _ in known) / max(cells, 1), sum(unlike)
         missed = missed if which == "right" else len(known) - missed
-        row += f"{len(known):6d}{np.median([each.cells for each in known] or [0]):7.0f}{agree:8.1%}{missed:6d}"
+        row += f"{len(known):6d}{np.median([each.cells for each, _ in known] or [0]):7.0f}{agree:8.1%}{missed:6d}"
     return row
 
 

@@ -49,9 +49,9 @@ def _least_squares(terms: FloatArray, values: FloatArray) -> FloatArray:
 class LensSamples:
     """N points all over what is drawn of an image, and how the radii of models that are fitted must be there."""
 
-    straight: FloatArray  # (N, 2): where a lens without distortion shows them, pixels
+    pinhole: FloatArray  # (N, 2): where a lens without distortion shows them, pixels
     measured: FloatArray  # (N, 2): where the lens does
-    undistorted: FloatArray  # (N,): radii of ``straight``, from the distortion centre, focal lengths
+    undistorted: FloatArray  # (N,): radii of ``pinhole``, from the distortion centre, focal lengths
     distorted: FloatArray  # (N,): the same of ``measured`` along these directions, without what the model has besides
 
     @classmethod
@@ -59,17 +59,17 @@ class LensSamples:
         """Sample a camera for models with the focal lengths, centre and tangential terms of ``base``."""
         measured = points_over(camera.image_size, _GRID)
         measured = measured[np.linalg.norm(measured - camera.center, axis=1) <= camera.drawn_radius]
-        straight = (camera.lens_model or camera).undistort(measured)
-        known = np.isfinite(straight).all(axis=1)
-        straight, measured = straight[known], measured[known]
-        flat = (straight - base.center) / base.mean_focal
+        pinhole = (camera.lens_model or camera).undistort(measured)
+        known = np.isfinite(pinhole).all(axis=1)
+        pinhole, measured = pinhole[known], measured[known]
+        flat = (pinhole - base.center) / base.mean_focal
         radius = np.linalg.norm(flat, axis=1)
-        moved = np.einsum("ij,ij->i", (measured - base.distort(straight)) / base.focal, flat)
-        return cls(straight, measured, radius, radius + moved / np.maximum(radius, 1e-300))
+        moved = np.einsum("ij,ij->i", (measured - base.distort(pinhole)) / base.focal, flat)
+        return cls(pinhole, measured, radius, radius + moved / np.maximum(radius, 1e-300))
 
-    def fit(self, start: FloatArray, powers: Sequence[int], size: float = 1.0) -> FloatArray:
-        """Find coefficients (K,): ``u + Σ k (size u)^p / size`` are the measured radii, ``u`` those of ``start``."""
-        return _least_squares((start[:, None] * size) ** np.array(powers) / size, self.distorted - start)
+    def fit(self, ideal: FloatArray, powers: Sequence[int]) -> FloatArray:
+        """Find coefficients (K,): ``u + Σ k u^p`` are the measured radii, ``u`` the ideal ones."""
+        return _least_squares(ideal[:, None] ** np.array(powers), self.distorted - ideal)
 
     def fit_rational(self) -> FloatArray:
         """Find coefficients (6,): ``u (1 + k1 u² + k2 u⁴ + k3 u⁶) / (1 + k4 u² + k5 u⁴ + k6 u⁶)`` are the radii.
@@ -94,7 +94,7 @@ class LensSamples:
 
     def compare(self, lens: LensModel) -> LensFit:
         """Compare a model's measured points with these."""
-        error = np.linalg.norm(lens.distort(self.straight) - self.measured, axis=1)
+        error = np.linalg.norm(lens.distort(self.pinhole) - self.measured, axis=1)
         return LensFit(float(np.sqrt(np.mean(error**2))), float(error.max()))
 
 
@@ -130,8 +130,8 @@ def nearest_model(
     for model, name in names.items():
         base = _without_radial_terms(camera, model.kind)
         samples = LensSamples.of(camera, base)
-        start = np.arctan(samples.undistorted) if model is FISHEYE else samples.undistorted
-        numbers = samples.fit(start, model.powers) if model.powers else samples.fit_rational()
+        ideal = np.arctan(samples.undistorted) if model is FISHEYE else samples.undistorted
+        numbers = samples.fit(ideal, model.powers) if model.powers else samples.fit_rational()
         k = tuple(base.coefficients[i] if at is None else float(numbers[at]) for i, at in enumerate(model.fitted))
         fits.append((fitted := replace(base, coefficients=k, kind=model.kind), samples.compare(fitted), name))
         if fits[-1][1].largest <= close:
@@ -181,8 +181,8 @@ def fitted_camera(lens: LensModel, kind: str, size: tuple[int, int], field: str 
 
 def fit_lens(forward: Forward, camera: Camera) -> tuple[Camera, LensFit]:
     """Fit the division model to another lens model: with λ alone where that is enough, else with μ, else with ν too."""
-    straight, measured, weights = _rays(forward, camera)
-    flat, bent = camera.normalize(straight), camera.normalize(measured)
+    pinhole, measured, weights = _rays(forward, camera)
+    flat, bent = camera.normalize(pinhole), camera.normalize(measured)
     radius = np.linalg.norm(bent, axis=1)
     # A lens without distortion is what a model that is off centre or tangential would otherwise be fitted to.
     ratio = np.einsum("ij,ij->i", flat, bent) / np.maximum(radius**2, 1e-300)
@@ -193,7 +193,7 @@ def fit_lens(forward: Forward, camera: Camera) -> tuple[Camera, LensFit]:
             lens = camera.with_coefficients(*coefficients)
         except ArgumentError:
             continue
-        error = np.linalg.norm(lens.distort(straight) - measured, axis=1)
+        error = np.linalg.norm(lens.distort(pinhole) - measured, axis=1)
         if not np.isfinite(error).all():
             continue
         fit = LensFit(float(np.sqrt(weights @ error**2 / weights.sum())), float(error.max()))
@@ -219,7 +219,7 @@ def _fit_divisor(radius2: FloatArray, divisor: FloatArray, weights: FloatArray, 
 
 
 def _rays(forward: Forward, camera: Camera) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Points along rays from the centre to the border of the measured image: straight, measured, and their areas."""
+    """Points along rays from the centre to the border of the measured image: pinhole, measured, and their areas."""
     angles = np.arange(_RAYS) * (2.0 * np.pi / _RAYS)
     radii = np.linspace(0.0, _REACH * camera.scale, _SAMPLES + 1)[1:]
     rays = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None] * radii[None, :, None] + camera.center

@@ -12,22 +12,24 @@ film.
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
 from msgspec import Meta, Struct
 
+from rdstitch.arrays import FloatArray
 from rdstitch.camera_files.lens_models import CLOSE, CameraFile, LensFit, LensSamples, fitted_camera
 from rdstitch.camera_files.own_record import Written, comments
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.lens_model import LensModel
+from rdstitch.geometry.lens_model import LensKind, LensModel
 from rdstitch.system.records import Side, convert, parse_xml
 
 _RECTILINEAR, _CIRCULAR_FISHEYE, _FISHEYE = 0, 2, 3
 _FILM = math.hypot(36.0, 24.0)  # mm, at crop factor 1
 _TERMS = {"poly3": {"k1": 3}, "poly5": {"k1": 3, "k2": 5}, "ptlens": {"a": 4, "b": 3, "c": 2}}  # powers by their names
+_HUGIN = tuple(_TERMS["ptlens"].values())
 _PARAMETER = re.compile(r"([A-Za-z]+)(\"[^\"]*\"|\S*)")
 HEAD = """# hugin project file
 #hugin_ptoversion 2
@@ -100,11 +102,11 @@ def read_polynomial(
 def hugin_lens(camera: Camera) -> tuple[dict[str, float], LensFit]:
     """The size and lens of an image line by Hugin's names, and how far that is from the lens."""
     width, height = camera.image_size
-    lens = fitted_polynomial(camera, min(camera.image_size) / 2, (4, 3, 2))
-    fit, (scale, (a, b, c)) = lens.fit, lens.moved()
-    half_width = width / 2 / (lens.focal * scale)
-    view = 2.0 * math.degrees(half_width if lens.fisheye else math.atan(half_width))
-    projection = _FISHEYE if lens.fisheye else _RECTILINEAR
+    (lens, fit), powers = fitted_polynomial(camera, _HUGIN), _HUGIN
+    scale, (a, b, c) = kept_at_unit(terms_in(lens, min(camera.image_size) / 2, powers), powers)
+    half_width, fisheye = width / 2 / (lens.mean_focal * scale), lens.kind != "polynomial"
+    view = 2.0 * math.degrees(half_width if fisheye else math.atan(half_width))
+    projection = _FISHEYE if fisheye else _RECTILINEAR
     d, e = camera.center[0] - (width - 1) / 2, camera.center[1] - (height - 1) / 2
     size: dict[str, float] = {"w": width, "h": height, "f": projection, "v": view}
     return {**size, "a": a, "b": b, "c": c, "d": d, "e": e, "g": 0, "t": 0}, fit
@@ -117,51 +119,47 @@ def image_line(values: Mapping[str, float]) -> str:
 
 def hugin_project(camera: Camera) -> Written:
     """A project with one image of this lens, for "load lens" or as a template."""
-    (width, height), (lens, fit) = camera.image_size, hugin_lens(camera)
-    text = (
-        f'{HEAD}{comments(camera, fit, "a, b, c")}p f0 w{width} h{height} v{lens["v"]:.6g} n"TIFF_m c:LZW"\nm i0\n'
-        f'i {image_line(lens)} r0 p0 y0 TrX0 TrY0 TrZ0 n"image.jpg"\n'
-    )
-    return text, fit
+    lens, fit = hugin_lens(camera)
+    panorama = " ".join(f"{name}{lens[name]:.6g}" for name in "fwhv")
+    image = f'i {image_line(lens)} r0 p0 y0 TrX0 TrY0 TrZ0 n"image.jpg"'
+    return f'{HEAD}{comments(camera, fit, "a, b, c")}p {panorama} n"TIFF_m c:LZW"\nm i0\n{image}\n', fit
 
 
-@dataclass(frozen=True)
-class Polynomial:
-    """A lens as ``r_d = r + Σ k r^p`` of the undistorted radius (of a fisheye its angle), in ``unit`` pixels."""
-
-    powers: tuple[int, ...]
-    coefficients: tuple[float, ...]  # k, for the scale of the centre
-    focal: float  # there, pixels
-    fisheye: bool
-    fit: LensFit
-
-    def moved(self) -> tuple[float, tuple[float, ...]]:
-        """How much larger the undistorted image is with the scale kept at r = 1, ``1 - Σ k`` at the centre; and k.
-
-        r = s u, where s (1 - Σ k) = 1, and k are those found over s^p.
-        """
-        # Imported late: no other command should wait for SciPy's optimizers.
-        from scipy.optimize import newton
-
-        terms = list(zip(self.coefficients, self.powers, strict=True))
-        # Near 1: far from it the powers have roots of their own.
-        scale = float(newton(lambda s: s - 1.0 - sum(k / s ** (p - 1) for k, p in terms), 1.0))
-        return scale, tuple(k / scale**p for k, p in terms)
-
-
-def fitted_polynomial(camera: Camera, unit: float, powers: tuple[int, ...]) -> Polynomial:
+def fitted_polynomial(camera: Camera, powers: tuple[int, ...]) -> tuple[LensModel, LensFit]:
     """The polynomial of a camera by least squares; a fisheye's where that is nearer and the other one is not close."""
-    focal, lenses = camera.with_guessed_focal().focal, []
+    focal = camera.with_guessed_focal().focal
     assert focal is not None
-    size, base = focal / unit, LensModel((focal, focal), camera.center, (), "polynomial")
+    base, fits = LensModel((focal, focal), camera.center, (), "polynomial"), []
     samples = LensSamples.of(camera, base)
-    for fisheye, straight in ((False, samples.undistorted), (True, np.arctan(samples.undistorted))):
-        values = tuple(samples.fit(straight, powers, size).tolist())
-        terms = dict(zip(powers, values, strict=True))
-        series = tuple(terms.get(p, 0.0) * size ** (p - 1) for p in range(2, max(powers) + 1))
-        lens = replace(base, coefficients=series, kind="fisheye polynomial" if fisheye else "polynomial")
-        lenses.append(Polynomial(powers, values, focal, fisheye, samples.compare(lens)))
-    return lenses[0] if lenses[0].fit.largest <= CLOSE else min(lenses, key=lambda lens: lens.fit.largest)
+    kinds: tuple[tuple[LensKind, FloatArray], ...] = (
+        ("polynomial", samples.undistorted),
+        ("fisheye polynomial", np.arctan(samples.undistorted)),
+    )
+    for kind, ideal in kinds:
+        terms = dict(zip(powers, samples.fit(ideal, powers).tolist(), strict=True))
+        lens = replace(base, coefficients=tuple(terms.get(p, 0.0) for p in range(2, max(powers) + 1)), kind=kind)
+        fits.append((lens, samples.compare(lens)))
+    return fits[0] if fits[0][1].largest <= CLOSE else min(fits, key=lambda fit: fit[1].largest)
+
+
+def terms_in(lens: LensModel, unit: float, powers: tuple[int, ...]) -> tuple[float, ...]:
+    """K of ``r_d = r + Σ k r^p`` of the undistorted radius, or of a fisheye's angle, in ``unit`` pixels."""
+    size = lens.mean_focal / unit
+    return tuple(lens.coefficients[p - 2] / size ** (p - 1) for p in powers)
+
+
+def kept_at_unit(terms: tuple[float, ...], powers: tuple[int, ...]) -> tuple[float, tuple[float, ...]]:
+    """How much larger the undistorted image is with the scale kept at r = 1, ``1 - Σ k`` at the centre; and k.
+
+    r = s u, where s (1 - Σ k) = 1, and k are those given over s^p.
+    """
+    # Imported late: no other command should wait for SciPy's optimizers.
+    from scipy.optimize import newton
+
+    of_powers = list(zip(terms, powers, strict=True))
+    # Near 1: far from it the powers have roots of their own.
+    scale = float(newton(lambda s: s - 1.0 - sum(k / s ** (p - 1) for k, p in of_powers), 1.0))
+    return scale, tuple(k / scale**p for k, p in of_powers)
 
 
 def read_lensfun(text: str, file: str, image_size: Callable[[], tuple[int, int]] | None) -> CameraFile:
@@ -204,15 +202,18 @@ def lensfun_xml(camera: Camera) -> Written:
     Maker, model, mount and crop factor are for the user to fill in: a camera file does not know them.
     """
     (width, height), unit = camera.image_size, (min(camera.image_size) - 1) / 2
-    fits = [(name, fitted_polynomial(camera, unit, tuple(terms.values()))) for name, terms in _TERMS.items()]
-    close = (fit for fit in fits if fit[1].fit.largest <= CLOSE)
-    model, lens = next(close, None) or min(fits, key=lambda fit: fit[1].fit.largest)
-    scale, moved = (1.0, lens.coefficients) if model == "poly5" else lens.moved()
-    values = " ".join(f'{name}="{value:.9g}"' for name, value in zip(_TERMS[model], moved, strict=True))
+    fits = [(model, *fitted_polynomial(camera, tuple(terms.values()))) for model, terms in _TERMS.items()]
+    close = (one for one in fits if one[2].largest <= CLOSE)
+    model, lens, fit = next(close, None) or min(fits, key=lambda one: one[2].largest)
+    powers = tuple(_TERMS[model].values())
+    scale, terms = 1.0, terms_in(lens, unit, powers)
+    if model != "poly5":
+        scale, terms = kept_at_unit(terms, powers)
+    values = " ".join(f'{name}="{value:.9g}"' for name, value in zip(_TERMS[model], terms, strict=True))
     x, y = ((c - (n - 1) / 2) / unit for c, n in zip(camera.center, (width, height), strict=True))
-    focal = lens.focal * scale / math.hypot(width, height) * _FILM
+    focal = lens.mean_focal * scale / math.hypot(width, height) * _FILM
     text = f"""<!--
-{comments(camera, lens.fit, model)}-->
+{comments(camera, fit, model)}-->
 <lensdatabase version="1">
   <lens>
     <maker>Unknown</maker>
@@ -220,7 +221,7 @@ def lensfun_xml(camera: Camera) -> Written:
     <mount>Generic</mount>
     <cropfactor>1</cropfactor>
     <aspect-ratio>{max(width, height) / min(width, height):.6g}</aspect-ratio>
-    <type>{"fisheye" if lens.fisheye else "rectilinear"}</type>
+    <type>{"rectilinear" if lens.kind == "polynomial" else "fisheye"}</type>
     <center x="{x:.9g}" y="{y:.9g}"/>
     <calibration>
       <distortion model="{model}" focal="{focal:.6g}" {values}/>
@@ -228,4 +229,4 @@ def lensfun_xml(camera: Camera) -> Written:
   </lens>
 </lensdatabase>
 """
-    return text, lens.fit
+    return text, fit

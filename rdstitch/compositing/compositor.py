@@ -16,6 +16,7 @@ from rdstitch.compositing.projection import TURN
 from rdstitch.compositing.seam_finder import SeamMap
 from rdstitch.compositing.source_images import PlacedImage
 from rdstitch.compositing.tiles import BlockRunner, strips_of
+from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.formats import check_format, check_memory
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.strips import ImageSpec
@@ -23,7 +24,7 @@ from rdstitch.io.tiff import ExtraTag
 from rdstitch.io.write import write_strips
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.results.messages import Message
-from rdstitch.system.outputs import Fingerprint, Outputs
+from rdstitch.system.outputs import Outputs
 from rdstitch.system.progress import FractionProgress, no_progress
 
 
@@ -109,8 +110,9 @@ def compose_to_file(
         # Nothing goes on behind a writer that fails.
         with closing(strips_of(tiles, elsewhere, progress)) as strips:
             tags, workers = extra_tags(canvas), tiles.workers
-            written, notes = write_strips(path, layout, strips, tags, outputs=outputs, workers=workers)
-    return FileComposite(canvas, written, (*decisions.messages, *notes), renderer.seams, tiles.box[:2])
+            written = write_strips(path, layout, strips, tags, outputs=outputs, workers=workers)
+    messages = (*decisions.messages, *written.messages)
+    return FileComposite(canvas, written.fingerprint, messages, renderer.seams, tiles.box[:2])
 
 
 def photo_sphere_xmp(canvas: Canvas) -> bytes:

@@ -7,7 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.compositing.canvas import Canvas, canvas_between, plan_canvas, refuse_scale, turned_and_scaled
+from rdstitch.choices import ProjectionName
+from rdstitch.compositing.canvas import (
+    Canvas,
+    canvas_between,
+    check_placement,
+    plan_canvas,
+    refuse_scale,
+    turned_and_scaled,
+)
 from rdstitch.compositing.projection import PLANE, PROJECTIONS, TURN, Projection
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.geometry.camera import Camera, points_over
@@ -82,7 +90,7 @@ def plan_panorama(
     cameras: Sequence[Camera],
     directions: FloatArray,
     *,
-    projection: str = "auto",
+    projection: ProjectionName = "auto",
     scale: float = 1.0,
     rotate: float = 0.0,
     reference: int | None = None,
@@ -94,13 +102,16 @@ def plan_panorama(
     As :func:`rdstitch.compositing.plan_canvas`. What the projection would stretch more than ``max_stretch`` times has
     no place on it: the ends of a plane, the top and the bottom of a cylinder.
     """
+    called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)
+    check_placement(cameras, directions, scale, rotate, reference, called, max_stretch)
+    if projection != "auto" and projection not in PROJECTIONS:
+        raise ArgumentError(f"projection must be one of auto, {', '.join(PROJECTIONS)}, not {projection!r}")
     seen = seen_directions(cameras, directions)
     chosen = choose_projection(seen) if projection == "auto" else PROJECTIONS[projection]
     if chosen == PLANE:
         return plan_canvas(
             cameras, directions, scale=scale, rotate=rotate, reference=reference, names=names, max_stretch=max_stretch
         )
-    called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)
     lengths = np.linalg.norm(directions, axis=1)
     focal = lengths[:, 2] / lengths[:, 0] * [camera.scale for camera in cameras]
     resolution = scale * float(np.median(focal) if reference is None else focal[reference])

@@ -21,6 +21,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.compositing.boxes import Float32Array
 from rdstitch.compositing.lattice import LATTICE_STEPS, interpolated
 from rdstitch.compositing.warp import Geometry
+from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import nodes_around
 
@@ -53,7 +54,7 @@ class Exposure:
     def __post_init__(self) -> None:
         """Refuse factors that are NaN, which would silently become black."""
         if not all(np.isfinite(part).all() for part in (self.log_gain, self.vignetting, self.fields, self.white)):
-            raise ValueError("exposure is not finite")
+            raise ArgumentError("exposure is not finite")
 
     def part(self, images: Sequence[int]) -> "Exposure":
         """The same for some of the images."""

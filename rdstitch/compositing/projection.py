@@ -188,6 +188,6 @@ class Stereographic(Projection):
 
 
 PLANE = Plane()
-PROJECTIONS: dict[str, Projection] = {
+PROJECTIONS: dict[ProjectionName, Projection] = {
     projection.name: projection for projection in (PLANE, Cylinder(), Sphere(), Mercator(), Panini(), Stereographic())
 }

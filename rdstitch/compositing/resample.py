@@ -10,8 +10,13 @@ from rdstitch.compositing.boxes import Float32Array
 from rdstitch.compositing.source_images import LoadedImage
 from rdstitch.compositing.transparency import OPAQUE
 from rdstitch.compositing.warp import Geometry
+from rdstitch.options.composite_options import Interpolation
 
-INTERPOLATION = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos": cv2.INTER_LANCZOS4}
+INTERPOLATION: dict[Interpolation, int] = {
+    "linear": cv2.INTER_LINEAR,
+    "cubic": cv2.INTER_CUBIC,
+    "lanczos": cv2.INTER_LANCZOS4,
+}
 _TOO_LONG = 32767  # OpenCV resamples from no side as long as this, pixels
 _KERNEL_MARGIN = 8  # room around a piece of an image for the kernel of the resampling, pixels
 _MIN_WEIGHT = np.float32(1e-6)
@@ -31,7 +36,7 @@ def border_weight(geometry: Geometry) -> Float32Array:
     return weight
 
 
-def sample(image: LoadedImage, geometry: Geometry, interpolation: str = "cubic") -> NDArray[Any]:
+def sample(image: LoadedImage, geometry: Geometry, interpolation: Interpolation = "cubic") -> NDArray[Any]:
     """Resample an image; content is mirrored outside of it, so that filters find no edge there.
 
     The image is prepared for ``geometry.warp.shrink``; the result is (h, w) or (h, w, C), in its sample type.

@@ -31,8 +31,8 @@ def layer_files(names: Sequence[str], folder: str | Path) -> dict[str, tuple[Pat
 
     They are called like the images without their suffixes, or with them, where two files would have one name.
     """
-    whole = [file_name(name) for name in names]
-    for stems in ([Path(name).stem for name in whole], whole):
+    safe = [file_name(name) for name in names]
+    for stems in ([Path(name).stem for name in safe], safe):
         files = [(Path(folder) / f"{stem}.tif", Path(folder) / f"{stem}_mask.tif") for stem in stems]
         if len({str(file).casefold() for pair in files for file in pair}) == 2 * len(files):
             return dict(zip(names, files, strict=True))
@@ -114,7 +114,7 @@ def _write_cropped_tiff(
     positions = [
         (tag, _RATIONAL, 1, (at, _DPI), True) for tag, at in zip((_X_POSITION, _Y_POSITION), offset, strict=True)
     ]
-    whole = [(tag, _LONG, 1, side, True) for tag, side in zip((_FULL_WIDTH, _FULL_LENGTH), size, strict=True)]
+    full_size = [(tag, _LONG, 1, side, True) for tag, side in zip((_FULL_WIDTH, _FULL_LENGTH), size, strict=True)]
     tifffile.imwrite(
         path,
         samples if extra else samples[..., 0] if colours == 1 else samples,
@@ -125,7 +125,7 @@ def _write_cropped_tiff(
         predictor=samples.dtype.kind == "u",
         resolution=(_DPI, _DPI),
         resolutionunit="inch",
-        extratags=[*positions, *whole, *extra_tags],
+        extratags=[*positions, *full_size, *extra_tags],
         metadata=None,
         software=False,
     )

@@ -45,10 +45,10 @@ def write_map(result: StitchResult, folder: Path, height: float, outputs: Output
     assert result.output is not None
     image = read_image(outputs.where(result.output))
     grey = image.pixels if image.pixels.ndim == 2 else cv2.cvtColor(image.pixels[..., :3], cv2.COLOR_RGB2GRAY)
-    if grey.dtype != np.uint8:
-        low, high = float(grey.min()), float(grey.max())
-        grey = np.rint((grey - low) * (255.0 / max(high - low, 1e-12))).astype(np.uint8)
     alpha = np.full(grey.shape, 255, np.uint8) if image.alpha is None else image.alpha
+    if grey.dtype != np.uint8 and alpha.any():
+        low, high = float(grey[alpha > 0].min()), float(grey[alpha > 0].max())
+        grey = np.rint((np.clip(grey, low, high) - low) * (255.0 / max(high - low, 1e-12))).astype(np.uint8)
     shown = [cv2.warpAffine(layer, to_map, (width, length), flags=cv2.INTER_LINEAR) for layer in (grey, alpha)]
     grey, alpha = (np.asarray(layer, np.uint8) for layer in shown)
     spec = ImageSpec((width, length), 1, grey.dtype, transparent=True, metadata=Metadata((width, length)))

@@ -37,7 +37,7 @@ def poses_table(result: StitchResult, frame: PosesFrame = "enu", height: float =
     registration = result.registration
     path = Trajectory.from_alignment(registration.alignment, height)
     if frame == "map":
-        poses, to_map, place = _poses_and_map(result)
+        poses, to_map, place = _poses_and_map(result, "leave out --frame map")
         path = Trajectory.on_map(poses, to_map, place.map_scale)
     sources = registration.sources
     numbers = [source.number(k) for k, source in enumerate(sources)]
@@ -45,13 +45,14 @@ def poses_table(result: StitchResult, frame: PosesFrame = "enu", height: float =
     return as_csv(path, "enu" if frame == "map" else frame)
 
 
-def _poses_and_map(result: StitchResult) -> tuple[PlanarPoses, FloatArray, Georeference]:
+def _poses_and_map(result: StitchResult, remedy: str) -> tuple[PlanarPoses, FloatArray, Georeference]:
     """The poses, what leads (2, 3) from their plane to the map, and the place of the output there."""
     place, poses = result.georeference, result.registration.alignment.poses
     if place is None or poses is None:
-        raise ArgumentError(f"there is no map for the poses: {result.not_georeferenced}; leave out --frame map")
+        reason = result.not_georeferenced if place is None else "one homography per image has no poses"
+        raise ArgumentError(f"there is no map for the poses: {reason}; {remedy}")
     if (to_pixels := result.canvas.from_level_plane) is None:
-        raise ArgumentError("poses have no map where the plane was tilted to be upright; leave out --frame map")
+        raise ArgumentError(f"poses have no map where the plane was tilted to be upright; {remedy}")
     return poses, place.pixel_to_map @ to_pixels, place
 
 
@@ -60,28 +61,36 @@ def poses_file(result: StitchResult, file: str | Path, frame: PosesFrame = "enu"
     name = Path(file).name.lower()
     if name not in ("images.txt", "geo.txt"):
         return poses_table(result, frame, height)
-    sources, poses = result.registration.sources, result.registration.alignment.poses
-    names = [source.name for source in sources]
-    if any(source.metadata.orientation != 1 for source in sources):
+    poses, used = result.registration.alignment.poses, result.placed.sources
+    if any(source.metadata.orientation != 1 for source in used):
         raise ArgumentError(f"{file}: images that EXIF turns have other axes there; turn the files first")
-    if blank := next((name for name in names if any(map(str.isspace, name))), None):
+    if blank := next((source.name for source in used if any(map(str.isspace, source.name))), None):
         raise ArgumentError(f"{file}: names end at blanks there; rename {blank}")
     if name == "geo.txt":
-        poses, to_map, place = _poses_and_map(result)
-        heights = poses.height * math.hypot(to_map[0, 0], to_map[1, 0]) / place.map_scale
-        known = (None if s.metadata.gps is None else s.metadata.gps.altitude for s in sources)
-        altitudes = [math.nan if altitude is None else altitude for altitude in known]
-        above = np.array(altitudes) - heights
-        ground = float(np.median(above[np.isfinite(above)])) if np.isfinite(above).any() else 0.0
-        centres = np.column_stack([_on_map(poses, to_map)[:, :2], ground + heights])
-        located = [(name, centre) for name, centre in zip(names, centres, strict=True) if np.isfinite(centre).all()]
-        rows = ["{} {:.4f} {:.4f} {:.4f}".format(name, *centre) for name, centre in located]
-        return "\n".join([f"EPSG:{place.crs.epsg}", *rows]) + "\n"
+        return _geo_of_opendronemap(result)
     if poses is None:
         raise ArgumentError(f"{file}: one homography per image has no poses; --model pose gives some")
-    if len({_lens(camera) for camera in result.registration.alignment.cameras}) > 1:
+    if len({_lens(camera) for camera in result.placed.cameras}) > 1:
         raise ArgumentError(f"{file}: the images are of several cameras or sizes, and there they have the same one")
-    return _images_of_colmap(names, poses, None if result.georeference is None else _poses_and_map(result)[1])
+    to_map = None if result.georeference is None else _poses_and_map(result, "leave out --straighten")[1]
+    return _images_of_colmap([source.name for source in result.registration.sources], poses, to_map)
+
+
+def _geo_of_opendronemap(result: StitchResult) -> str:
+    """The text of ``geo.txt``: the ground is where altitudes, as far as they are known, have it."""
+    poses, to_map, place = _poses_and_map(result, "write images.txt or a table")
+    metadata = [source.metadata for source in result.registration.sources]
+    heights = poses.height * math.hypot(to_map[0, 0], to_map[1, 0]) / place.map_scale
+    altitudes = [math.nan if m.gps is None or m.gps.altitude is None else m.gps.altitude for m in metadata]
+    known = (np.array(altitudes) - heights)[np.isfinite(altitudes) & np.isfinite(heights)]
+    ground = float(np.median(known)) if len(known) else 0.0
+    centres = np.column_stack([_on_map(poses, to_map)[:, :2], ground + heights])
+    rows = [
+        "{} {:.4f} {:.4f} {:.4f}".format(source.name, *centre)
+        for source, centre in zip(result.registration.sources, centres, strict=True)
+        if np.isfinite(centre).all()
+    ]
+    return "\n".join([f"EPSG:{place.crs.epsg}", *rows]) + "\n"
 
 
 def _lens(camera: Camera) -> tuple[object, ...]:

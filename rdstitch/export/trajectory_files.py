@@ -73,8 +73,8 @@ def as_csv(path: Trajectory, frame: TrajectoryFrame) -> str:
     covariances = np.zeros((count, 0))
     if path.covariance is not None:
         units = np.array([1.0, 1.0, 1.0, np.degrees(1.0)])
-        there = covariance_in_frame(path.covariance, frame) * np.outer(units, units)
-        covariances = np.stack([there[:, i, j] for i, j in _PAIRS], axis=1)
+        in_degrees = covariance_in_frame(path.covariance, frame) * np.outer(units, units)
+        covariances = np.stack([in_degrees[:, i, j] for i, j in _PAIRS], axis=1)
     table.writerow([*_COLUMNS, *(f"cov_{_POSE[i]}_{_POSE[j]}" for i, j in _PAIRS if covariances.size)])
     poses = (path.position, np.degrees(path.yaw), path.height)
     rows = zip(path.frame, names, numbers, times, *poses, covariances + 0.0, strict=True)

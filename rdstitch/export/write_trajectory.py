@@ -44,7 +44,7 @@ def write_trajectory(
         with outputs.writing(file) as staged:
             _write_bag(path, staged, frame)
     else:
-        with outputs.writing(file, is_folder=True, check=_check_folder) as staged:
+        with outputs.writing_folder(file, _check_folder) as staged:
             # The files of a bag are named for their folder.
             _write_bag(path, inner := staged / file.name, frame)
             for part in inner.iterdir():

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import FeatureName
 from rdstitch.features.keypoints import Detection, Features
 from rdstitch.features.learned import detect_aliked
 from rdstitch.features.opencv import detect_opencv
@@ -21,15 +22,18 @@ _SPREAD_CELL = 0.05  # side of a cell over which keypoints are spread, diagonals
 _LASTING = 0.5
 
 
-def find(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection:
-    """Find the keypoints of an image by the detector that the options name."""
-    if options.kind == "surf":
-        return detect_surf(grey)
-    if options.kind == "aliked":
-        return detect_aliked(grey, options)
-    if options.kind in ("sift", "rootsift") and grey.size > LARGE:
-        return detect_sift_in_tiles(grey, options)
-    return detect_opencv(grey, options)
+def _detect_sift(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection:
+    return detect_sift_in_tiles(grey, options) if grey.size > LARGE else detect_opencv(grey, options)
+
+
+_DETECTORS: dict[FeatureName, Callable[[NDArray[np.uint8], FeatureOptions], Detection]] = {
+    "rootsift": _detect_sift,
+    "sift": _detect_sift,
+    "surf": lambda grey, _: detect_surf(grey),
+    "orb": detect_opencv,
+    "akaze": detect_opencv,
+    "aliked": detect_aliked,
+}
 
 
 def strongest(response: FloatArray, count: int) -> NDArray[np.intp]:
@@ -65,20 +69,17 @@ def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask 
     The image is grey or RGB, with alpha or without; uint16 and float are stretched to 8 bits. No keypoint reaches into
     places where alpha is zero, a float is not finite, or the mask is False or zero.
     """
-    return detect_view(lambda _: View(image, mask), options or FeatureOptions())
+    return detect_view(lambda _: View.of(image, mask), options or FeatureOptions())
 
 
-def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
+def detect_view(load: ViewLoader, options: FeatureOptions) -> Features:
     """As :func:`detect`, for an image that is loaded as large as it is needed."""
     most, megapixels = options.limits
-    image, detection, usable = _find(source, options, megapixels)
+    image, detection, usable = _find(load, options, megapixels)
     detected_count, few = len(usable), len(usable) < _MIN_KEYPOINT_FRACTION * most
-    low_contrast = False
-    if few:  # with differences of grey levels divided by the most that equalization multiplies them by
-        weakened = np.rint(image.grey / CLIP_LIMIT).astype(np.uint8)
-        low_contrast = len(_usable(image, find(weakened, options))) <= _LASTING * detected_count
+    low_contrast = few and _has_low_contrast(image, detected_count, options)
     if megapixels is not None and image.reduced and few:
-        image, detection, usable = _find(source, options, CLOSER * megapixels)
+        image, detection, usable = _find(load, options, CLOSER * megapixels)
     points, response = detection.points[usable], detection.response[usable]
     if options.spread:
         cell = _SPREAD_CELL * float(np.hypot(*image.grey.shape))
@@ -99,12 +100,18 @@ def detect_view(source: ViewLoader, options: FeatureOptions) -> Features:
 
 
 def _find(
-    source: ViewLoader, options: FeatureOptions, megapixels: float | None
+    load: ViewLoader, options: FeatureOptions, megapixels: float | None
 ) -> tuple[PreparedImage, Detection, NDArray[np.intp]]:
     """The image at most so large, the keypoints detected in it, and which of them keep clear of the mask."""
-    image = prepare(source(megapixels), megapixels, stretch=options.stretch, equalize=bool(options.equalize))
-    detection = find(image.grey, options)
+    image = prepare(load(megapixels), megapixels, stretch=options.stretch, equalize=bool(options.equalize))
+    detection = _DETECTORS[options.kind](image.grey, options)
     return image, detection, _usable(image, detection)
+
+
+def _has_low_contrast(image: PreparedImage, detected_count: int, options: FeatureOptions) -> bool:
+    """Whether most keypoints vanish where contrast is divided by the most that equalization multiplies it by."""
+    weakened = np.rint(image.grey / CLIP_LIMIT).astype(np.uint8)
+    return len(_usable(image, _DETECTORS[options.kind](weakened, options))) <= _LASTING * detected_count
 
 
 def _usable(image: PreparedImage, detection: Detection) -> NDArray[np.intp]:

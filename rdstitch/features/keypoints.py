@@ -23,8 +23,8 @@ class Features:
 
     # (N, 2), float64: keypoints ``(u, v)``, pixels of the full-size image, whatever size they were detected at
     points: FloatArray
-    # (N, D), float32: numbers that are compared by their Euclidean distance (float32), or bits, eight to a byte, that
-    # are compared by the Hamming distance (uint8)
+    # (N, D): float32 numbers, compared by their Euclidean distance; or uint8, eight bits to a byte, compared by the
+    # Hamming distance
     descriptors: Descriptors
     scale: FloatArray  # (N,), float64: diameter of the keypoint (OpenCV's ``size``), pixels of the full-size image
     angle: FloatArray  # (N,), float64: orientation, radians in [0, 2π), from u towards v; 0 where the kind has none
@@ -96,9 +96,8 @@ class PackedFeatures:
     """Features as they are stored: descriptors in a quarter or half of their size, which matching cannot tell apart."""
 
     features: Features  # their descriptors are replaced by none
-    # (N, D), uint8, float16: bits; integers up to 255 such as SIFT's and, but for rare ones, RootSIFT's, which lose
-    # nothing; else half precision, which is finer than the grid of 1/512 of the largest norm on which descriptors are
-    # compared
+    # (N, D). uint8: bits, or integers up to 255, such as SIFT's and nearly all of RootSIFT's; else float16, which is
+    # finer than the grid of 1/512 of the largest norm on which descriptors are compared; float32 beyond its range
     descriptors: NDArray[Any]
     bits: bool  # whether descriptors are bits
 

@@ -1,6 +1,7 @@
 """The detectors that OpenCV brings, in the steps that all detectors take: find, choose, describe."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, cast
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import FeatureName
 from rdstitch.errors import ArgumentError
 from rdstitch.features.keypoints import Descriptors, Detection, Features
 from rdstitch.options.feature_options import FeatureOptions
@@ -30,7 +32,8 @@ _SCRATCH_OF_A_PIXEL = 230
 
 def detect_opencv(grey: Grey, options: FeatureOptions, octaves: Sequence[int] | None = None) -> Detection:
     """Find keypoints, all or those of some octaves as OpenCV packs them; see :func:`create_detector` for errors."""
-    detector, kind = create_detector(options), options.kind
+    kind = _KINDS[options.kind]
+    detector = create_detector(options)
     with scratch_memory(_SCRATCH_OF_A_PIXEL * grey.size):
         keypoints = detector.detect(grey, None) if min(grey.shape) >= _MIN_IMAGE else ()
     table = _table(keypoints, "size", "angle", "octave", "response")
@@ -41,7 +44,7 @@ def detect_opencv(grey: Grey, options: FeatureOptions, octaves: Sequence[int] | 
     table, ordered = table[order], [keypoints[i] for i in order]
 
     def describe(chosen: NDArray[np.intp]) -> Features:
-        """Those too near the border for OpenCV drop out."""
+        """Features of keypoints of some indices, without those too near the border for OpenCV."""
         wanted = [ordered[i] for i in chosen]
         with scratch_memory(_SCRATCH_OF_A_PIXEL * grey.size):
             described, descriptors = detector.compute(grey, wanted) if wanted else ((), None)
@@ -52,16 +55,16 @@ def detect_opencv(grey: Grey, options: FeatureOptions, octaves: Sequence[int] | 
         points, (size, degrees, response) = table[:, :2].copy(), table[:, 2:].T
         return Features(
             points=points,
-            descriptors=to_rootsift(descriptors) if kind == "rootsift" else cast(Descriptors, descriptors),
+            descriptors=to_rootsift(descriptors) if kind.rooted else cast(Descriptors, descriptors),
             scale=size,
             # OpenCV marks "no orientation" by -1.
             angle=np.where(degrees < 0, 0.0, np.radians(degrees) % (2 * np.pi)),
-            response=_strength(kind, response, size),
-            laplacian_sign=_laplacian_sign(grey, points, size) if kind in ("sift", "rootsift") else None,
-            kind=kind,
+            response=kind.strength(response, size),
+            laplacian_sign=_laplacian_sign(grey, points, size) if kind.of_blobs else None,
+            kind=options.kind,
         )
 
-    return Detection(table[:, :2], table[:, 2], _strength(kind, table[:, 5], table[:, 2]), describe)
+    return Detection(table[:, :2], table[:, 2], kind.strength(table[:, 5], table[:, 2]), describe)
 
 
 def _laplacian_sign(grey: Grey, points: FloatArray, size: FloatArray) -> NDArray[np.int8]:
@@ -72,7 +75,7 @@ def _laplacian_sign(grey: Grey, points: FloatArray, size: FloatArray) -> NDArray
     sums, last = cv2.integral(grey), np.array(grey.shape[::-1]) - 1
 
     def mean(radius: FloatArray) -> FloatArray:
-        """Of the boxes around all points, cut off at the border of the image."""
+        """Mean grey level of the boxes around all points, cut off at the border of the image."""
         (u1, v1), (u2, v2) = (
             np.clip(np.rint(points + side * radius[:, None]), 0, last).astype(np.intp).T + (side > 0)
             for side in (-1, 1)
@@ -95,21 +98,53 @@ def _table(keypoints: Sequence[cv2.KeyPoint], *names: str) -> FloatArray:
 
 def create_detector(options: FeatureOptions) -> Any:
     """Make the OpenCV detector of a kind of features."""
-    kind = options.kind
     try:
-        if kind in ("sift", "rootsift"):
-            # Without the precise upscale all points are a quarter of a pixel off.
-            return cv2.SIFT.create(nfeatures=0, contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
-        if kind == "orb":
-            # Many more than wanted, because ORB keeps the strongest of the whole image and we spread them.
-            return cv2.ORB.create(nfeatures=8 * options.limits[0], fastThreshold=_ORB_FAST_THRESHOLD)
-        # OpenCV 5 moved it to xfeatures2d.
-        namespace: Any = cv2 if hasattr(cv2, "AKAZE_create") else cv2.xfeatures2d
-        return namespace.AKAZE_create(threshold=_AKAZE_THRESHOLD)
+        return _KINDS[options.kind].create(options)
     except (AttributeError, cv2.error) as error:
         raise ArgumentError(
             f"features {options.kind!r} are not in this OpenCV ({cv2.__version__}); choose others"
         ) from error
+
+
+def _sift(options: FeatureOptions) -> Any:
+    # Without the precise upscale all points are a quarter of a pixel off.
+    return cv2.SIFT.create(nfeatures=0, contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
+
+
+def _orb(options: FeatureOptions) -> Any:
+    # Many more than wanted, because ORB keeps the strongest of the whole image and we spread them.
+    return cv2.ORB.create(nfeatures=8 * options.limits[0], fastThreshold=_ORB_FAST_THRESHOLD)
+
+
+def _akaze(options: FeatureOptions) -> Any:
+    # OpenCV 5 moved it to xfeatures2d.
+    namespace: Any = cv2 if hasattr(cv2, "AKAZE_create") else cv2.xfeatures2d
+    return namespace.AKAZE_create(threshold=_AKAZE_THRESHOLD)
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """What differs between OpenCV's detectors."""
+
+    create: Callable[[FeatureOptions], Any]
+    of_blobs: bool = False  # dark or light ones, by differences of Gaussians
+    rooted: bool = False  # descriptors, see :func:`to_rootsift`
+
+    def strength(self, response: FloatArray, size: FloatArray) -> FloatArray:
+        """Strengths by which keypoints are chosen.
+
+        For SIFT contrast times size: by contrast alone the choice is mostly tiny ones, which drown in noise. On real
+        pairs of images the product gives a fifth to a half more inliers, among other detectors it does not help.
+        """
+        return response * size if self.of_blobs else response
+
+
+_KINDS: dict[FeatureName, _Kind] = {
+    "sift": _Kind(_sift, of_blobs=True),
+    "rootsift": _Kind(_sift, of_blobs=True, rooted=True),
+    "orb": _Kind(_orb),
+    "akaze": _Kind(_akaze),
+}
 
 
 def to_rootsift(descriptors: Descriptors) -> NDArray[np.float32]:
@@ -121,12 +156,3 @@ def to_rootsift(descriptors: Descriptors) -> NDArray[np.float32]:
     total = np.maximum(values.sum(axis=1, keepdims=True), np.float32(1.0))
     rooted: NDArray[np.float32] = np.rint(np.sqrt(values / total) * np.float32(_ROOTSIFT_NORM))
     return rooted
-
-
-def _strength(kind: str, response: FloatArray, size: FloatArray) -> FloatArray:
-    """Strengths by which keypoints are chosen.
-
-    For SIFT contrast times size: by contrast alone the choice is mostly tiny ones, which drown in noise. On real pairs
-    of images the product gives a fifth to a half more inliers, among other detectors it does not help.
-    """
-    return response * size if kind in ("sift", "rootsift") else response

@@ -1,8 +1,8 @@
 """An image as detectors want it: grey, 8 bits, of working size, with the distance to what is masked."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -29,11 +29,23 @@ Stretch = tuple[float, float]
 class View:
     """An image as it was loaded, whole or smaller."""
 
-    image: PixelArray  # (height, width) or (height, width, bands)
+    image: PixelArray  # (height, width) or (height, width, bands), without alpha
     mask: Mask | None = None  # (height, width), bool: true or not zero where the image counts; None for everywhere
     reduction: int = 1  # blocks of so many pixels a side of the whole image are one pixel
     # width and height of the whole image, pixels; where it is not given, this is the whole
     image_size: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.mask is not None and self.mask.shape != self.image.shape[:2]:
+            raise ArgumentError(f"mask of shape {self.mask.shape} for an image of shape {self.image.shape[:2]}")
+
+    @classmethod
+    def of(cls, image: PixelArray, mask: Mask | None = None) -> Self:
+        """A whole image, grey or RGB, whose last band of two or four is its alpha."""
+        if image.ndim != 3 or image.shape[2] not in (2, 4):
+            return cls(image, mask)
+        view, shown = cls(image[..., :-1], mask), image[..., -1] > 0
+        return replace(view, mask=shown if mask is None else shown & (mask != 0))
 
     @property
     def full_size(self) -> tuple[int, int]:
@@ -118,14 +130,8 @@ def _checked(image: PixelArray) -> PixelArray:
 
 
 def _usable(image: PixelArray, mask: Mask | None) -> NDArray[np.bool_] | None:
-    """Combine mask, alpha and finiteness into where features are allowed; None for everywhere."""
-    parts: list[NDArray[np.bool_]] = []
-    if mask is not None:
-        if mask.shape != image.shape[:2]:
-            raise ArgumentError(f"mask of shape {mask.shape} for an image of shape {image.shape[:2]}")
-        parts.append(mask != 0)
-    if image.ndim == 3 and image.shape[2] in (2, 4):
-        parts.append(image[..., -1] > 0)
+    """Combine mask and finiteness into where features are allowed; None for everywhere."""
+    parts: list[NDArray[np.bool_]] = [] if mask is None else [mask != 0]
     if image.dtype.kind == "f":
         parts.append(np.asarray(np.isfinite(image.reshape(*image.shape[:2], -1)).all(axis=2)))
     parts = [part for part in parts if not part.all()]
@@ -133,7 +139,7 @@ def _usable(image: PixelArray, mask: Mask | None) -> NDArray[np.bool_] | None:
 
 
 def _grey(image: PixelArray) -> PixelArray:
-    """Luminance of grey, grey with alpha, RGB and RGB with alpha; the mean of more bands."""
+    """The first of one or two bands, the luminance of the first three of three or four, the mean of more."""
     if image.ndim == 2:
         return image
     if image.shape[2] < 3:

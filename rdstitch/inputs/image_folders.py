@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rdstitch.errors import InputError
 from rdstitch.io.opening import HEIF_SUFFIXES, RAW_SUFFIXES
-from rdstitch.system.file_access import MAX_FILE, canonical_name, canonical_text, read_limited
+from rdstitch.system.file_access import MAX_TEXT, canonical_name, canonical_text, read_limited
 
 READABLE_SUFFIXES = frozenset(
     [".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif", ".bmp", ".tga", ".jp2", ".ppm", ".pgm", ".pnm", ".gif"]
@@ -47,7 +47,7 @@ def place_of(path: Path) -> Path:
 def is_rdstitch_output(path: Path) -> bool:
     """Whether rdstitch wrote this image: the sidecar beside it says so, and means this one."""
     try:
-        record = json.loads(read_limited(path.with_name(path.name + ".json"), MAX_FILE))
+        record = json.loads(read_limited(path.with_name(path.name + ".json"), MAX_TEXT))
         is_sidecar = record["format"] == "rdstitch sidecar"
         return is_sidecar and canonical_text(str(record["output"]["file"])) == canonical_name(path.name)
     except (OSError, ValueError, TypeError, LookupError, RecursionError):

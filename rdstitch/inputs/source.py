@@ -126,10 +126,7 @@ class Source:
         """Read what detection at so many 10⁶ pixels needs; it is kept for the stages that read it again."""
         reduction = self.reduction(megapixels)
         image = self.read(reduction, keep=True)
-        # A last band of two or four would be taken for alpha there; here that is apart.
-        bands = image.pixels.shape[2:]
-        pixels = image.pixels[..., :-1] if bands in ((2,), (4,)) else image.pixels
-        return View(pixels, image.alpha, reduction, self.camera.image_size)
+        return View(image.pixels, image.alpha, reduction, self.camera.image_size)
 
     def _load(self, reduction: int) -> DecodedImage:
         """Read the pixels, corrected and masked."""

@@ -22,7 +22,7 @@ from rdstitch.errors import InputError
 from rdstitch.io.ome import MICROMETRES, Page, ome_pixel_size, ome_planes, ome_tree
 from rdstitch.io.opening import TIFF_MAGIC, decoding
 from rdstitch.io.read_tiff import image_pages, read_page
-from rdstitch.system.file_access import canonical_name, canonical_text, open_regular
+from rdstitch.system.file_access import canonical_name, canonical_text, open_regular, read_text
 from rdstitch.system.late_imports import tifffile
 
 _FOLDER_METADATA = "metadata.txt"
@@ -254,8 +254,8 @@ def _micro_manager(name: Path, entries: Sequence[tuple[Page, Mapping[str, Any]]]
 def _micro_manager_folder(folder: Path) -> dict[str, StoredTile]:
     """Tiles by the names of their files, of a folder with Micro-Manager's metadata; none of others."""
     try:
-        content = json.loads((folder / _FOLDER_METADATA).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        content = json.loads(read_text(folder / _FOLDER_METADATA))
+    except (InputError, ValueError, RecursionError):
         return {}
     groups: dict[object, list[tuple[Page, Mapping[str, Any]]]] = {}
     for key, entry in content.items() if isinstance(content, dict) else ():

@@ -7,8 +7,9 @@ WebP. The same image gives the same bytes either way.
 import io
 import os
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from PIL import Image
 
 from rdstitch.errors import ArgumentError
 from rdstitch.io.deepzoom import write_deep_zoom
+from rdstitch.io.fingerprint import Fingerprint, fingerprint
 from rdstitch.io.formats import check_format
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.ome_tiff import OME_SUFFIXES, write_ome_tiff
@@ -27,7 +29,7 @@ from rdstitch.io.write_jpeg import jpeg_pieces
 from rdstitch.io.write_png import png_pieces
 from rdstitch.results.messages import Message
 from rdstitch.system.output_checks import check_folder, is_zarr, naming, tiles_folder
-from rdstitch.system.outputs import Fingerprint, Outputs, fingerprint
+from rdstitch.system.outputs import Outputs
 
 _TIFF = (".tif", ".tiff")
 _JPEG = (".jpg", ".jpeg")
@@ -66,6 +68,13 @@ def write_image(
         write_strips(path, spec, strips, outputs=staging)
 
 
+class Written(NamedTuple):
+    """An image that was written."""
+
+    fingerprint: Fingerprint
+    messages: list[Message]  # what the user should know of it
+
+
 def write_strips(
     path: str | Path,
     spec: ImageSpec,
@@ -74,10 +83,8 @@ def write_strips(
     *,
     outputs: Outputs | None = None,
     workers: int = 1,
-) -> tuple[Fingerprint, list[Message]]:
-    """Write an image that comes in strips; see :func:`write_image`. Gives size and digest of what was written.
-
-    And what the user should know of it.
+) -> Written:
+    """Write an image that comes in strips; see :func:`write_image`.
 
     ``workers``: threads that may encode, beside what makes the next strips.
     """
@@ -85,19 +92,20 @@ def write_strips(
     check_format(file, spec)
     checked, tiles, messages = check_strips(spec, strips), None, list[Message]()
     with Outputs.or_own(outputs) as staging:
+        check = partial(check_folder, overwrite=True)
         if file.suffix.lower() == ".dzi":
             folder = tiles_folder(Path(os.path.realpath(file)))
-            check_folder(folder, overwrite=True)
-            with staging.writing(folder, is_folder=True) as tiles, staging.writing(file) as staged:
+            check(folder)
+            with staging.writing_pair(folder, file, check) as (tiles, staged):
                 write_deep_zoom(staged, tiles, spec, checked)
         elif is_zarr(file):
-            with staging.writing(file, is_folder=True) as staged:
+            with staging.writing_folder(file, check) as staged:
                 write_ome_zarr(staged, spec, checked)
         else:
             with staging.writing(file) as staged:
                 messages = _write_file(staged, file.name.lower(), spec, checked, extra_tags, workers)
         with naming(file):
-            return fingerprint(staged, tiles), messages
+            return Written(fingerprint(staged, tiles), messages)
 
 
 def _write_file(

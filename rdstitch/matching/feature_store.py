@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.features import Correspondences, Features, PackedFeatures
 from rdstitch.geometry.camera import Camera
-from rdstitch.system.cache import Cache, Stored
+from rdstitch.system.cache import Cache, InMemory, Stored
 
 Size = tuple[int, int]
 
@@ -31,7 +31,7 @@ class StoredFeatures:
     @classmethod
     def of(cls, features: Features) -> Self:
         """Features that stay in memory."""
-        return cls.at(Stored(value=PackedFeatures.pack(features)))
+        return cls.at(InMemory(PackedFeatures.pack(features)))
 
     @classmethod
     def at(cls, stored: Stored[PackedFeatures]) -> Self:
@@ -58,7 +58,7 @@ class StoredFeatures:
 
     def key(self, cache: Cache) -> str:
         """What stands for them in the inputs of later results; empty without a cache."""
-        return cache.digest((self.stored.name or self.stored.value, self.image_size, self.chosen))
+        return cache.digest((self.stored.key, self.image_size, self.chosen))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ class StoredMatches:
     @classmethod
     def of(cls, matches: Correspondences) -> Self:
         """Matches that stay in memory."""
-        return cls(Stored(value=matches), len(matches))
+        return cls(InMemory(matches), len(matches))
 
     def __len__(self) -> int:
         """Number of matches."""
@@ -135,7 +135,7 @@ class StoredMatches:
 
     def key(self, cache: Cache) -> str:
         """What stands for them in the inputs of later results; empty without a cache."""
-        return cache.digest((self.stored.name or self.stored.value, self.sizes))
+        return cache.digest((self.stored.key, self.sizes))
 
 
 def _at_size(features: Features, size: Size) -> Features:

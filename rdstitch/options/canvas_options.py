@@ -6,7 +6,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from rdstitch.choices import ProjectionName
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import Contradiction, FileUse, Range, option
+from rdstitch.options.option import Contradiction, Range, option, reads
 from rdstitch.options.upright_options import UprightOptions
 
 
@@ -66,12 +66,7 @@ class CanvasOptions(UprightOptions):
         "--crs",
         within=Range(above=0, below=2**16),
     )
-    like: str | Path | None = option(
-        None,
-        "Grid of the output: coordinate system, pixels and extent of this GeoTIFF file.",
-        "FILE",
-        file=FileUse.READ,
-    )
+    like: str | Path | None = reads("Grid of the output: coordinate system, pixels and extent of this GeoTIFF file.")
     extent: tuple[float, float, float, float] | None = option(
         None,
         "Extent of the output on the map, metres: on the pixels of --like, else from the north-west corner on.",

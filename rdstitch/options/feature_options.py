@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 from rdstitch.choices import FeatureName
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import FileUse, Options, Range, documented, option
+from rdstitch.options.option import Options, Range, documented, option, reads
 
 WORK_MEGAPIXELS = 0.6  # 10⁶ pixels to which images of a large set are halved unless it is said otherwise
 MAX_FEATURES = 2000  # keypoints kept per image of a large set unless it is said otherwise
@@ -46,9 +46,7 @@ class FeatureOptions(Options):
         "Equalize local contrast before detection; None: of a set whose images show too little otherwise.",
         flag=None,
     )
-    aliked_model: str | Path | None = option(
-        None, "ONNX file of the network of --features aliked.", "FILE", file=FileUse.READ
-    )
+    aliked_model: str | Path | None = reads("ONNX file of the network of --features aliked.")
     aliked_size: int = option(
         640, "Side of the square image that the network takes, pixels.", within=Range(least=1), flag=None
     )
@@ -62,11 +60,11 @@ class FeatureOptions(Options):
 
     def for_images(self, count: int) -> Self:
         """The same with numbers for what was left open: fewer than eight images share what eight would have."""
-        share = max(_BUDGET / max(count, 1), 1.0)
+        factor = max(_BUDGET / max(count, 1), 1.0)
         return replace(
             self,
-            max_features=self.max_features or round(MAX_FEATURES * min(share, _MAX_FEATURES)),
-            work_megapixels=WORK_MEGAPIXELS * min(share, _MAX_PIXELS)
+            max_features=self.max_features or round(MAX_FEATURES * min(factor, _MAX_FEATURES)),
+            work_megapixels=WORK_MEGAPIXELS * min(factor, _MAX_PIXELS)
             if self.work_megapixels == "auto"
             else self.work_megapixels,
         )

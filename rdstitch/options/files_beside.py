@@ -6,10 +6,8 @@ from typing import Self
 
 from rdstitch.choices import PosesFrame
 from rdstitch.errors import ArgumentError
-from rdstitch.options.option import FileUse, Options, documented, option, options_of
+from rdstitch.options.option import Options, documented, option, options_of, writes
 from rdstitch.options.shared_options import Height
-
-_REPORT_SUFFIXES = (".html", ".htm")
 
 
 @documented
@@ -17,17 +15,8 @@ _REPORT_SUFFIXES = (".html", ".htm")
 class ReportFile(Options):
     """What is written of a registration, also of one that is refused."""
 
-    report: Path | None = option(
-        None, "Write a report to FILE (.html): graph, votes on λ, matches, residuals.", "FILE", file=FileUse.WRITTEN
-    )
+    report: Path | None = writes("Write a report to FILE (.html): graph, votes on λ, matches, residuals.")
     command: str = ""  # the command line, for the report
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.report is not None:
-            from rdstitch.system.output_checks import check_suffix
-
-            check_suffix(self.report, _REPORT_SUFFIXES)
 
 
 @documented
@@ -35,19 +24,14 @@ class ReportFile(Options):
 class ImageFiles(ReportFile):
     """What is written beside an image, whatever its images are."""
 
-    layers: Path | None = option(
-        None,
+    layers: Path | None = writes(
         "Write each image, warped, with alpha, and its mask into DIR: TIFF, cropped, with the offsets that "
         "enblend reads.",
         "DIR",
-        file=FileUse.WRITTEN,
     )
     whole_layers: bool = option(False, "With --layers: on the whole canvas instead of cropped.")
-    hugin_project: Path | None = option(
-        None,
-        "Write a project for Hugin (.pto): all images with lens and pose, and control points.",
-        "FILE",
-        file=FileUse.WRITTEN,
+    hugin_project: Path | None = writes(
+        "Write a project for Hugin (.pto): all images with lens and pose, and control points."
     )
 
     def __post_init__(self) -> None:
@@ -61,12 +45,9 @@ class ImageFiles(ReportFile):
 class FilesBeside(ImageFiles):
     """What is written beside an image, published together with it; the report of a result that is refused too."""
 
-    poses: Path | None = option(
-        None,
+    poses: Path | None = writes(
         "Write the pose of the camera for each image: CSV with covariances, as 'rdstitch trajectory' does; "
-        "images.txt: COLMAP's; geo.txt: OpenDroneMap's.",
-        "FILE",
-        file=FileUse.WRITTEN,
+        "images.txt: COLMAP's; geo.txt: OpenDroneMap's."
     )
     frame: PosesFrame = option(
         "enu",
@@ -75,12 +56,10 @@ class FilesBeside(ImageFiles):
         "ground, metres, where the output is georeferenced.",
     )
     height: Height = None
-    map_server: Path | None = option(
-        None,
+    map_server: Path | None = writes(
         "Write map.yaml and map.png, which nav2_map_server loads, into DIR; in metres by --height, with the first "
         "image at the origin and its top along x.",
         "DIR",
-        file=FileUse.WRITTEN,
     )
 
     @property

@@ -90,6 +90,16 @@ def option(value: Any, text: str, metavar: str = "", flag: str | None = "", **mo
     return field(default=value, metadata={"option": Option(text, metavar, flag, **more)})
 
 
+def reads(text: str, metavar: str = "FILE") -> Any:
+    """A field that names a file or folder that is read, if any."""
+    return option(None, text, metavar, file=FileUse.READ)
+
+
+def writes(text: str, metavar: str = "FILE") -> Any:
+    """A field that names a file or folder that is written, if any."""
+    return option(None, text, metavar, file=FileUse.WRITTEN)
+
+
 @dataclass(frozen=True)
 class Declared:
     """An option with its name and type: one of some words, a value of other types, or None."""

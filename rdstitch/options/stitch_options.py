@@ -10,7 +10,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.estimation_options import EstimationOptions, RansacOptions
 from rdstitch.options.feature_options import FeatureOptions
-from rdstitch.options.option import Contradiction, FileUse, Range, Unit, documented, option
+from rdstitch.options.option import Contradiction, Range, Unit, documented, option, reads, writes
 from rdstitch.options.shared_options import (
     ArrayChannels,
     Distortion,
@@ -55,19 +55,14 @@ class StitchOptions(RansacOptions):
         within=Range(above=0.0),
         flag=None,
     )
-    lightglue_model: str | Path | None = option(
-        None, "LightGlue network (ONNX) for these features.", "FILE", file=FileUse.READ
-    )
+    lightglue_model: str | Path | None = reads("LightGlue network (ONNX) for these features.")
     lens: LensName = option(
         "auto", "Lens to estimate: λ; λ and the distortion centre; besides them a second or a third coefficient."
     )
     model: ModelName = option("auto", "Motion model of the camera.")
-    camera: "Camera | str | Path | None" = option(
-        None,
+    camera: "Camera | str | Path | None" = reads(
         "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap, Hugin or lensfun; its lens is not "
-        "estimated.",
-        "FILE",
-        file=FileUse.READ,
+        "estimated."
     )
     distortion: Distortion = None
     focal: float | None = option(
@@ -80,11 +75,8 @@ class StitchOptions(RansacOptions):
         within=Range(above=-math.pi / 2, below=math.pi / 2),
         unit=Unit.RADIANS,
     )
-    attitude: Literal["xmp"] | str | Path | None = option(
-        None,
-        "Tilt of each image: CSV name,psi,theta in degrees; xmp: from the XMP of drone images.",
-        "FILE|xmp",
-        file=FileUse.READ,
+    attitude: Literal["xmp"] | str | Path | None = reads(
+        "Tilt of each image: CSV name,psi,theta in degrees; xmp: from the XMP of drone images.", "FILE|xmp"
     )
     attitude_std: float = option(
         math.radians(1.0),
@@ -93,26 +85,18 @@ class StitchOptions(RansacOptions):
         within=Range(least=0.0, most=math.pi / 2),
         unit=Unit.RADIANS,
     )
-    timestamps: str | Path | None = option(
-        None,
+    timestamps: str | Path | None = reads(
         "Time stamps of the images: CSV name,timestamp, lines TIME NAME, or a time a line; otherwise those of the "
-        "video, bag or EXIF.",
-        "FILE",
-        file=FileUse.READ,
+        "video, bag or EXIF."
     )
-    odometry: "Odometry | str | Path | None" = option(
-        None,
+    odometry: "Odometry | str | Path | None" = reads(
         "Wheel odometry, by time: TUM's lines, CSV timestamp,x,y,yaw_deg, or a topic of the bag. It gives the unit of "
         "positions, and poses of frames without texture.",
         "FILE|TOPIC",
-        file=FileUse.READ,
     )
-    positions: str | Path | None = option(
-        None,
+    positions: str | Path | None = reads(
         "Where images were taken, instead of EXIF: CSV name,lat,lon or name,x,y (see --crs), exiftool's -csv or "
-        "-json, OpenDroneMap's geo.txt, or a GPX track.",
-        "FILE",
-        file=FileUse.READ,
+        "-json, OpenDroneMap's geo.txt, or a GPX track."
     )
     positions_offset: float = option(0.0, "Seconds from the times of the images to those of the GPX track (UTC).", "S")
     position_accuracy: float | None = option(
@@ -121,18 +105,12 @@ class StitchOptions(RansacOptions):
         "M",
         within=Range(above=0.0),
     )
-    gcp: str | Path | None = option(
-        None,
+    gcp: str | Path | None = reads(
         "Ground control points, as OpenDroneMap's gcp_list.txt, or CSV x,y,px,py,image,name,accuracy (see --crs); "
-        "they bend the alignment, and place the output on the Earth.",
-        "FILE",
-        file=FileUse.READ,
+        "they bend the alignment, and place the output on the Earth."
     )
-    check_points: str | Path | None = option(
-        None,
-        "Points like those of --gcp that are compared with the map, and take no part in it.",
-        "FILE",
-        file=FileUse.READ,
+    check_points: str | Path | None = reads(
+        "Points like those of --gcp that are compared with the map, and take no part in it."
     )
     mask: Mask = None
     channel_order: ArrayChannels = "bgr"
@@ -165,7 +143,7 @@ class StitchOptions(RansacOptions):
     overwrite: Overwrite = False
     strict: Strict = False
     force: bool = option(False, "Write the result even when it fails its own checks.")
-    save_camera: Path | None = option(None, "Write the estimated camera.", "FILE", file=FileUse.WRITTEN)
+    save_camera: Path | None = writes("Write the estimated camera.")
     camera_format: CameraFormat = option(
         "auto",
         "Format of the camera file written. auto: by its name, .json (rdstitch), .yml (OpenCV), .fisheye.yml, "

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from rdstitch.choices import Origin, ScanOrder, ZPlane
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.options.option import Contradiction, FileUse, Options, Range, documented, option
+from rdstitch.options.option import Contradiction, Options, Range, documented, option, reads, writes
 from rdstitch.options.shared_options import DryRun, FlatField, Overwrite, Strict, Topic, Workers
 
 if TYPE_CHECKING:
@@ -34,12 +34,9 @@ class TileOptions(Options):
             ("positions",), ("grid",), "positions and grid both say where the tiles are; leave one of them out"
         ),
     )
-    positions: "str | Path | ArrayLike | Mapping[str, ArrayLike] | None" = option(
-        None,
+    positions: "str | Path | ArrayLike | Mapping[str, ArrayLike] | None" = reads(
         "CSV with name,x,y (pixels) or name,x_um,y_um, or Fiji's TileConfiguration.txt; otherwise what OME-TIFF "
-        "or Micro-Manager say.",
-        "FILE",
-        file=FileUse.READ,
+        "or Micro-Manager say."
     )
     grid: str | None = option(
         None,
@@ -70,9 +67,7 @@ class TileOptions(Options):
     )
     time: int | None = option(None, "Time of a series, from 0; otherwise the first.", within=Range(least=0))
     flat_field: FlatField = "auto"
-    save_flat_field: str | Path | None = option(
-        None, "Write flat field and dark field to this TIFF file.", "FILE", file=FileUse.WRITTEN
-    )
+    save_flat_field: str | Path | None = writes("Write flat field and dark field to this TIFF file.")
     distortion: float | Literal["auto"] | None = option(
         None,
         "Known λ (half-diagonal frame), or auto: estimate it; otherwise 0 unless all overlaps show it.",

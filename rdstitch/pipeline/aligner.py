@@ -96,8 +96,8 @@ class Aligner:
     options: AlignmentOptions
     cache: Cache
     threshold: float  # largest transfer error of an inlier, pixels
+    quarters: QuarterTurns  # by which the images became upright; ``options`` are of the stored ones
     needs_poses: bool = False  # whether every alignment must have metric poses, see :meth:`metric`
-    quarters: QuarterTurns | None = None  # by which the images became upright; ``options`` are of the stored ones
 
     @classmethod
     def of(
@@ -109,11 +109,7 @@ class Aligner:
         cameras = tuple(at_working_size(source.camera.with_guessed_focal(), megapixels) for source in sources)
         control = sightings(sources, cameras)
         decided = replace(alignment_options(sources, options), purpose=purpose, control=control)
-        return cls(paths, cameras, decided, cache, options.threshold, quarters=QuarterTurns.of(sources))
-
-    @property
-    def _quarters(self) -> QuarterTurns:
-        return self.quarters or QuarterTurns((1,) * len(self.cameras))
+        return cls(paths, cameras, decided, cache, options.threshold, QuarterTurns.of(sources))
 
     @property
     def exact_tilts(self) -> list[tuple[float, float]] | None:
@@ -121,7 +117,7 @@ class Aligner:
         tilts = self.options.exact_tilts(len(self.cameras))
         if not tilts:
             return tilts
-        return [(psi, theta) for psi, theta in self._quarters.tilts(np.array(tilts)).tolist()]
+        return [(psi, theta) for psi, theta in self.quarters.tilts(np.array(tilts)).tolist()]
 
     def align(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
         """Align the images by the pairs that were registered; from an earlier run where the cache has it."""
@@ -211,7 +207,7 @@ class Aligner:
 
     def _task(self, distinct: _DistinctPairs) -> AlignmentTask:
         """What is aligned: images as they are stored, cut ones in a frame that holds each of them."""
-        stored, count = self._quarters.back, len(distinct.evidence)
+        stored, count = self.quarters.back, len(distinct.evidence)
         cameras = tuple(stored.camera(camera, k) for k, camera in enumerate(self.cameras))
         most = most_matches_read(count, self.options)
         named = (
@@ -246,7 +242,7 @@ class Aligner:
 
     def _options_without(self, copies: Mapping[int, int]) -> AlignmentOptions:
         """The options without copies: what is given of one is given of the image that it is a copy of."""
-        given, quarters = self.options, self._quarters
+        given, quarters = self.options, self.quarters
         control = []
         for one in given.control:
             first = copies.get(one.image, one.image)
@@ -272,9 +268,9 @@ class Aligner:
         for pair in pairs:
             if pair.relation and pair.images not in known:
                 errors = pair.errors(alignment.transfer)[pair.relation.inliers]
-                good = errors[errors < max(self.threshold, SAME_PX)]
-                rms = float(np.sqrt(np.mean(good**2))) if len(good) else math.nan
-                yield LinkFit(*pair.images, len(errors), len(good), rms, Unused.COPY)
+                agreeing = errors[errors < max(self.threshold, SAME_PX)]
+                rms = float(np.sqrt(np.mean(agreeing**2))) if len(agreeing) else math.nan
+                yield LinkFit(*pair.images, len(errors), len(agreeing), rms, Unused.COPY)
 
     def _counted_once(self, twice: Iterable[int]) -> Message:
         names = shortened(names_of(self.paths[k] for k in sorted(twice)))
@@ -289,10 +285,10 @@ class Aligner:
 
     def _upright(self, alignment: Alignment, task: AlignmentTask) -> Alignment:
         """An alignment of the images as they are stored as one of the upright images, each of its own size."""
-        sizes = [self._quarters.back.camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
+        sizes = [self.quarters.back.camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
         if any(camera.image_size != size for camera, size in zip(alignment.cameras, sizes, strict=True)):
             alignment = cut_alignment(alignment, sizes)
-        return self._quarters.alignment(alignment, task.options.gravity, task.near_copies)
+        return self.quarters.alignment(alignment, task.options.gravity, task.near_copies)
 
     def metric(self, aligned: AlignedPairs) -> AlignedPairs:
         """A draft of the same pairs by a model with metric poses, where the user left the choice of the model open."""

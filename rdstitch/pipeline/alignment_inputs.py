@@ -44,10 +44,10 @@ def alignment_options(sources: Sequence[Source], options: StitchOptions) -> Alig
 
 def sightings(sources: Sequence[Source], cameras: Sequence[Camera]) -> tuple[Sighting, ...]:
     """Ground control points in the images as the camera stored them, of the size that features are detected at."""
-    shown = [(k, point) for k, source in enumerate(sources) for point in source.control if not point.check]
-    metres = metres_around_median([point.place for _, point in shown])
+    sighted = [(k, point) for k, source in enumerate(sources) for point in source.control if not point.check]
+    metres = metres_around_median([point.place for _, point in sighted])
     sightings, stored = [], QuarterTurns.of(sources).back
-    for (k, point), (east, north) in zip(shown, metres.tolist(), strict=True):
+    for (k, point), (east, north) in zip(sighted, metres.tolist(), strict=True):
         x, y = stored.point(sources[k].camera.normalize(point.pixel) * cameras[k].scale, k).tolist()
         sightings.append(Sighting(k, (x, y), point.name, (east, north), point.std))
     return tuple(sightings)

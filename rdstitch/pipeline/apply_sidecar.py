@@ -90,9 +90,9 @@ def apply(
     if saved.record.stage is not None:
         given = with_position_folders(given)
     run = replace(run, inputs=given)
-    with run.found() as listed:
-        OutputPlan.of_images(run, listed.files).check()
-        result = apply_found(saved, listed, run, options)
+    with run.open_images() as replacements:
+        OutputPlan.of_images(run, replacements.files).check()
+        result = apply_to_images(saved, replacements, run, options)
     return replace(result, messages=(*([Message(mismatch)] if mismatch else []), *result.messages))
 
 
@@ -118,10 +118,10 @@ def apply_run(
     return replace(run, read=[saved.path, *options.files, *settings.files])
 
 
-def apply_found(saved: SavedRegistration, listed: FoundImages, run: Run, options: ApplyOptions) -> Recomposition:
+def apply_to_images(saved: SavedRegistration, images: FoundImages, run: Run, options: ApplyOptions) -> Recomposition:
     """Compose images that were found by a saved registration, into memory or among the outputs."""
     output = run.output
-    given = read_replacements(saved, listed.frames, options, run.guard, run.options.composite.max_memory)
+    given = read_replacements(saved, images.frames, options, run.guard, run.options.composite.max_memory)
     OutputPlan.of_images(run, ()).check_places(list(given.sources.values()))
     lens, of_lens = _lens_of_band(saved, given.sources, run.progress)
     plan, run, of_turn = _laid_out(saved, given.sources, lens, run)
@@ -132,7 +132,7 @@ def apply_found(saved: SavedRegistration, listed: FoundImages, run: Run, options
         sources=tuple(map(sources.get, range(len(saved.images)))),
         matched=given.matched,
         left_out=given.left_out,
-        messages=(*given.messages, *of_lens, *of_turn, *listed.messages, *run.guard.messages, *of_output),
+        messages=(*given.messages, *of_lens, *of_turn, *images.messages, *run.guard.messages, *of_output),
         **composed.fields,
     )
     if options.dry_run or output is None:
@@ -162,7 +162,8 @@ def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: Co
     matrix, size = saved.plane_to_output, saved.record.output.size
     same_sizes = all(saved.images[index].size == source.camera.image_size for index, source in used.items())
     alike = same_sizes and not saved.turned and options.same_canvas(saved.composite)
-    return SavedGrid(matrix, size, saved.output_place) if alike and matrix is not None and size is not None else None
+    place = saved.record.output.place
+    return SavedGrid(matrix, size, place) if alike and matrix is not None and size is not None else None
 
 
 def _lens_of_band(
@@ -178,9 +179,9 @@ def _lens_of_band(
         name = saved.images[next(iter(frames))].path
         text = f"the registered images are not there any more ({name}, …): whether the same lens took the given ones, "
         return None, [Message(f"{saved.path}: {text}from the same places, was not compared", severity="note")]
-    there = {k: file for k, file in originals.items() if file.resolve() != frames[k].path.resolve()}
+    elsewhere = {k: file for k, file in originals.items() if file.resolve() != frames[k].path.resolve()}
     pairs: dict[int, tuple[Source, Source]] = {}
-    for index, file in there.items():
+    for index, file in elsewhere.items():
         camera, size = saved.images[index].camera, used[index].camera.image_size
         if camera is not None and frames[index].number is None and camera.image_size == size:
             read, _ = read_sources([Frame(file)], skip_bad=True)

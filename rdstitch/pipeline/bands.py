@@ -16,14 +16,15 @@ from rdstitch.inputs.frame import Frame, Images
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import ImageSpec, write_strips
+from rdstitch.io.fingerprint import fingerprint
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.strips import Strip
 from rdstitch.io.tiff import written_strips
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.apply_sidecar import apply_found, apply_run
-from rdstitch.pipeline.recipes import stitch_found
+from rdstitch.pipeline.apply_sidecar import apply_run, apply_to_images
+from rdstitch.pipeline.recipes import stitch_images
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
@@ -31,7 +32,7 @@ from rdstitch.sidecar.read import read_sidecar
 from rdstitch.sidecar.recomposition import Recomposition
 from rdstitch.sidecar.write import sidecar
 from rdstitch.system.native_threads import one_native_thread
-from rdstitch.system.outputs import Outputs, fingerprint, json_bytes
+from rdstitch.system.outputs import Outputs, json_bytes
 from rdstitch.system.progress import Progress, silent
 
 
@@ -69,14 +70,14 @@ def mosaic_bands(
     if options.dry_run:
         raise ArgumentError("bands have no plan before the first of them is registered: leave out dry_run")
     stack = [file, Path(f"{file}.json")] if file.suffix.lower() in (".tif", ".tiff") else []
-    with run.found(file, *files[1:]) as listed:  # all are published together
-        frames = selected(listed.frames, options.exclude, options.include_only)
+    with run.open_images(file, *files[1:]) as images:  # all are published together
+        frames = selected(images.frames, options.exclude, options.include_only)
         chosen = _by_band(frames, bands)
         _check_alike(dict(zip(bands, chosen, strict=True)), in_one_file=bool(stack))
         whole = replace(run.options, exclude=(), include_only=())
-        run = replace(run, options=whole, read=[*run.read, *listed.files])
-        of_first = replace(listed, frames=chosen[0])
-        first = stitch_found(of_first, run, more_images=files[1:], more_files=stack)
+        run = replace(run, options=whole, read=[*run.read, *images.files])
+        of_first = replace(images, frames=chosen[0])
+        first = stitch_images(of_first, run, more_images=files[1:], more_files=stack)
         saved = replace(read_sidecar(outputs.where(f"{files[0]}.json")), path=Path(f"{files[0]}.json"))
         same = ApplyOptions(
             mask=options.mask,
@@ -87,7 +88,7 @@ def mosaic_bands(
         )
         of_band = replace(apply_run(saved, None, saved.composite, same, progress), outputs=outputs)
         others = tuple(
-            apply_found(saved, FoundImages(band, []), replace(of_band, output=name), same)
+            apply_to_images(saved, FoundImages(band, []), replace(of_band, output=name), same)
             for band, name in zip(chosen[1:], files[1:], strict=True)
         )
         if stack:

@@ -12,7 +12,7 @@ from rdstitch.inputs.selection import selected
 from rdstitch.inputs.times import with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.recipes import stitch_found
+from rdstitch.pipeline.recipes import stitch_images
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
@@ -56,22 +56,22 @@ def mosaic_blocks(
     refused: list[Message] = []
     run = Run.of(inputs, options, Purpose.MOSAIC, file, beside=beside, every=every, progress=progress)
     options = run.options
-    with run.found() as listed, ExitStack() as stack:  # all are published together, once the cache is gone
+    with run.open_images() as images, ExitStack() as stack:  # all are published together, once the cache is gone
         # What was found of images and pairs serves the next block.
         cache = options.cache or stack.enter_context(TemporaryFolder())
-        listed = replace(
-            listed, frames=list(with_times(listed.frames, options.timestamps)), notes=(*listed.notes, *run.notes)
+        images = replace(
+            images, frames=list(with_times(images.frames, options.timestamps)), notes=(*images.notes, *run.notes)
         )
-        frames = selected(listed.frames, options.exclude, options.include_only)
+        frames = selected(images.frames, options.exclude, options.include_only)
         names = [file, *(file.with_name(f"{file.stem}-{k}{file.suffix}") for k in range(2, len(frames) // 2 + 1))]
         run = replace(run, options=replace(run.options, cache=cache, timestamps=None), notes=())
         further = names[1:]
-        found = replace(listed, outputs=[], notes=())
+        remaining = replace(images, outputs=[], notes=())
         while len(frames) > 1 or not results:
             run = replace(run, output=names[len(results)])
             try:
                 with run.outputs.together():
-                    result = stitch_found(found, run, more_images=further)
+                    result = stitch_images(remaining, run, more_images=further)
                 registration = result.registration
             except RdstitchError as error:
                 if not results or isinstance(error, OutputError):
@@ -89,10 +89,10 @@ def mosaic_blocks(
             used = [source.frame or Frame(source.path) for source, used in pairs if used]
             done = {(frame.path, frame.number) for frame in used}
             frames = [frame for frame in frames if (frame.path, frame.number) not in done]
-            found = replace(found, frames=frames)
+            remaining = replace(remaining, frames=frames)
             # These are of the first block, or of its reference image.
             run, further = replace(run, options=_for_further_blocks(run.options), beside=NOTHING_BESIDE), []
-    return (_without_blocks(results[0], results[1:], [*listed.messages, *refused]), *map(_without_blocks, results[1:]))
+    return _naming_left_out_once(results, [*images.messages, *refused])
 
 
 def _for_further_blocks(options: StitchOptions) -> StitchOptions:
@@ -102,19 +102,16 @@ def _for_further_blocks(options: StitchOptions) -> StitchOptions:
     return replace(options, save_camera=None, reference=None, composite=composite, exclude=(), include_only=())
 
 
-def _without_blocks(
-    result: StitchResult, others: Sequence[StitchResult] | None = None, more: Sequence[Message] = ()
-) -> StitchResult:
-    """A block that does not name as left out what is in others; without others, nothing: the first one names it."""
-    elsewhere = {
-        str(source.path)
-        for registration in (other.registration for other in others or ())
-        for source, used in zip(registration.sources, registration.alignment.used, strict=True)
-        if used
-    }
-    kept = [
-        message
-        for message in result.registration.messages
-        if message.severity != "left out" or (others is not None and not elsewhere.issuperset(message.images))
-    ]
-    return replace(result, registration=replace(result.registration, messages=(*kept, *more)))
+def _naming_left_out_once(results: Sequence[StitchResult], messages: Sequence[Message]) -> tuple[StitchResult, ...]:
+    """Blocks of which the first names the images that are in none, and has messages on all."""
+    placed = {str(source.path) for result in results for source in result.placed.sources}
+    named = []
+    for block, result in enumerate(results):
+        kept = [
+            message
+            for message in result.messages
+            if message.severity != "left out" or (block == 0 and not placed.issuperset(message.images))
+        ]
+        more = messages if block == 0 else ()
+        named.append(replace(result, registration=replace(result.registration, messages=(*kept, *more))))
+    return tuple(named)

@@ -15,6 +15,7 @@ from functools import cache, partial
 
 import numpy as np
 
+from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray, evenly_spaced
@@ -34,7 +35,6 @@ from rdstitch.pipeline.lay_out import (
     straight_edges,
 )
 from rdstitch.pipeline.realign import by_second_motions, plane_of_most, realigned
-from rdstitch.pipeline.register import with_frontal_reference
 from rdstitch.pipeline.whole_pixels import on_whole_pixels
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message
@@ -66,7 +66,7 @@ class _Trials:
     def lay_out(self, registration: Registration, local: LocalAlignment | None = None) -> CandidateLayout:
         """Lay out a registration in pixels of the working size."""
         options = self.options
-        whole = on_whole_pixels(with_frontal_reference(at_full_size(registration), options, always=self.pano))
+        whole = on_whole_pixels(_with_frontal_reference(at_full_size(registration), options, always=self.pano))
         if local is None:
             local = align_registration_locally(whole, options.local_alignment, self.edges_of, options.threads)
         laid_out = lay_out(whole, local, options.composite)
@@ -109,6 +109,21 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
     if best.seams.by_chance and not options.force:
         raise RefusedError(best.registration.with_messages([_BY_CHANCE]))
     return best
+
+
+def _with_frontal_reference(registration: Registration, options: StitchOptions, *, always: bool) -> Registration:
+    """The same registration with an undistorted image as its plane; directions of a turn on the spot stay.
+
+    That is the reference image, unless it was chosen here and another one crosses its horizon. With ``always`` a
+    rectified plane, that of one camera's poses, gives way too.
+    """
+    alignment = registration.alignment
+    if alignment.on_sphere or (not always and alignment.poses is not None):
+        return registration
+    reference = alignment.reference if options.reference is not None else frontal_reference(alignment)
+    if not always and reference == alignment.reference:
+        return registration
+    return replace(registration, alignment=in_frame_of(alignment, reference))
 
 
 def _plane_behind(

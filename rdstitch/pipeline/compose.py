@@ -111,8 +111,8 @@ def compose_images(
     if plan.photographs:
         messages += seam_messages(plan.seams, [str(source.path) for source in placed.sources])
 
-    def report(share: float) -> None:
-        run.progress("compositing", round(100 * share), 100)
+    def report(fraction: float) -> None:
+        run.progress("compositing", round(100 * fraction), 100)
 
     def tags(final: Canvas) -> list[ExtraTag]:
         on_final = place_on_canvas(place, canvas, final)

@@ -41,44 +41,31 @@ _GRID = 24  # points a side by which an overlap is measured
 
 @dataclass(frozen=True)
 class Examination:
-    """What to expect of a run.
-
-    Attributes
-    ----------
-    images : int
-        That can be read.
-    unreadable : tuple of str
-        Every other one, with the reason.
-    sizes : tuple of (str, int)
-        "width x height" and how many images have it, commonest first.
-    cameras : tuple of (str, int)
-        Make, model and serial number by EXIF, and how many images; "unknown" where it says nothing.
-    focal : str
-        What is known of the focal length.
-    blurred, dark, burnt : tuple of str
-        Names of images that are much less sharp than the others, that are dark, and that are burnt out.
-    alone : tuple of str
-        Names of images that found no place among the others.
-    overlap : float or None
-        Median share of an image that its best partner shows too; None where nothing fits together.
-    plan : CompositePlan or None
-        Size of the mosaic, with memory and time of compositing it; None where there would be none.
-    advice : tuple of str
-        What to change, most important first; empty where nothing is amiss.
-    """
+    """What to expect of a run."""
 
     images: int
+    """That can be read."""
     unreadable: tuple[str, ...]
+    """Every other one, with the reason."""
     sizes: tuple[tuple[str, int], ...]
+    """Width x height and how many images have it, commonest first."""
     cameras: tuple[tuple[str, int], ...]
+    """Make, model and serial number by EXIF, and how many images; "unknown" where it says nothing."""
     focal: str
+    """What is known of the focal length."""
     blurred: tuple[str, ...]
+    """Names of images that are much less sharp than the others."""
     dark: tuple[str, ...]
     burnt: tuple[str, ...]
+    """Names of images that are burnt out."""
     alone: tuple[str, ...]
+    """Names of images that found no place among the others."""
     overlap: float | None
+    """Median share of an image that its best partner shows too; None where nothing fits together."""
     plan: CompositePlan | None
+    """Size of the mosaic, with memory and time of compositing it; None where there would be none."""
     advice: tuple[str, ...]
+    """What to change, most important first; empty where nothing is amiss."""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -193,26 +180,26 @@ def _measured(frames: Sequence[Frame], progress: Progress) -> tuple[list[Source]
     return read, unreadable, np.stack([sharpness, brightness * part, np.where(part < 1.0, 0.0, burnt)])
 
 
-def _advice(found: Examination, problems: Sequence[Message], *, zoomed: bool) -> tuple[str, ...]:
+def _advice(examination: Examination, problems: Sequence[Message], *, zoomed: bool) -> tuple[str, ...]:
     """What to change, most important first."""
-    known = [camera for camera, _ in found.cameras if camera != _UNKNOWN_CAMERA]
-    bad, overlap = found.unreadable, found.overlap
+    known = [camera for camera, _ in examination.cameras if camera != _UNKNOWN_CAMERA]
+    unreadable, overlap = examination.unreadable, examination.overlap
     advice = (
-        (found.images < 2, "stitching needs two images or more; name another one"),
+        (examination.images < 2, "stitching needs two images or more; name another one"),
         (len(known) > 1, f"the images come from {len(known)} cameras: stitch those of each on their own"),
         (zoomed, "the lens was zoomed between the images: stitch those of one zoom on their own"),
-        (bad, f"{len(bad)} file{'s' * (len(bad) != 1)} cannot be read: {''.join(bad[:1])}"),
+        (unreadable, f"{len(unreadable)} file{'s' * (len(unreadable) != 1)} cannot be read: {''.join(unreadable[:1])}"),
         *((True, str(problem)) for problem in problems),
         (
             overlap is not None and overlap < _MIN_OVERLAP,
             f"images overlap by about {overlap or 0.0:.0%} only: take more images, a third is the least",
         ),
         (
-            found.blurred,
-            f"leave blurred images out if their neighbours overlap without them: {shortened(found.blurred)}",
+            examination.blurred,
+            f"leave blurred images out if their neighbours overlap without them: {shortened(examination.blurred)}",
         ),
         (
-            found.dark or found.burnt,
+            examination.dark or examination.burnt,
             "dark or burnt-out images have few features: fix the exposure if you can take them again",
         ),
     )

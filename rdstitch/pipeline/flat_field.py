@@ -28,7 +28,8 @@ def check_one_size(sources: Sequence[Source]) -> None:
 def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list[Source], list[Message]]:
     """The tiles, which are read without the illumination that all have; and what there is to say of that."""
     # Imported late: images that are no tiles have no use for it.
-    from rdstitch.stage.estimate_flat_field import MIN_TILES, estimate_illumination
+    from rdstitch.stage.estimate_flat_field import FlatFieldUnknown, estimate_illumination
+    from rdstitch.stage.sentences import flat_field_estimated
 
     if wanted == "off":
         return list(sources), []
@@ -38,12 +39,9 @@ def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list
         field = read_flat_field(wanted, sources[0].camera.image_size, channels)
         return [replace(source, flat_field=field) for source in sources], []
     shown = estimate_illumination(lambda index: sources[index].read().pixels, len(sources))
-    if shown.field is None and len(sources) < MIN_TILES:
+    if shown is FlatFieldUnknown.FEW_TILES:
         text = f"{len(sources)} tiles are too few to show their flat field, and samples stay as they are"
         return list(sources), [Message(text, severity="note", code="flat-field")]
-    if shown.field is None:
+    if shown is FlatFieldUnknown.UNSURE:
         return list(sources), [NO_FLAT_FIELD]
-    levels = zip(shown.dark, shown.dark_error, strict=True)
-    dark = ", ".join(f"{level:.0f} ± {error:.0f}" if error > 0.0 else "not shown" for level, error in levels)
-    text = f"flat field: {shown.shading:.0%} less light where it is darkest, ± {shown.error:.1%}; dark level {dark}"
-    return [replace(source, flat_field=shown.field) for source in sources], [Message(text, severity="note")]
+    return [replace(source, flat_field=shown.field) for source in sources], [flat_field_estimated(shown)]

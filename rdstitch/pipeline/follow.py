@@ -64,8 +64,7 @@ def follow(
     unread: dict[Path, int] = {}  # numbers of frames that come again
     of_preview: list[Message] = []  # told with the next frame
     for arrived in frames:
-        number = unread.pop(arrived.path, -1)
-        number = next(numbers) if number < 0 else number
+        number = unread.pop(arrived.path) if arrived.path in unread else next(numbers)
         if not is_selected(arrived, options.exclude, options.include_only):
             continue
         frame = arrived if arrived.number is not None else replace(arrived, number=number)
@@ -125,8 +124,8 @@ class Tracker:
                 check_readable(Path(file))
         # Of frames that have been made ready.
         features = replace(self._detection, work_megapixels=None, stretch=None, equalize=False)
-        apart = (self._options.threads > 1 or not patient) and bool(sys.executable)
-        executor = ProcessExecutor(1) if apart else ThreadPoolExecutor(1)
+        in_process = (self._options.threads > 1 or not patient) and bool(sys.executable)
+        executor = ProcessExecutor(1) if in_process else ThreadPoolExecutor(1)
         weakref.finalize(self, executor.shutdown, wait=False, cancel_futures=True)
         matcher = partial(match, ratio=self._options.ratio)
         known = self._options.estimation, alignment_options([], self._options)

@@ -43,13 +43,13 @@ def with_image_circle(
         x, y = ((value + 0.5) * factor - 0.5 for value in circle.center)
         return Circle((x, y), _RIM * circle.radius * factor)
 
-    found = store.recall("circles", ([source.content(store) for source in chosen], size, megapixels), compute)
-    if found is None:
+    circle = store.recall("circles", ([source.content(store) for source in chosen], size, megapixels), compute)
+    if circle is None:
         return list(sources)
     return [
         source
         if source.camera.image_size != size
-        else replace(source, camera=replace(source.camera, center=found.center, image_circle=found.radius))
+        else replace(source, camera=replace(source.camera, center=circle.center, image_circle=circle.radius))
         for source in sources
     ]
 

@@ -124,8 +124,8 @@ def is_stretched(plan: CanvasPlan) -> bool:
         # A fisheye's border is stretched on any plane.
         flat = replace(image.camera, distortion=0.0, distortion2=0.0, distortion3=0.0, image_circle=None)
         middle, right, down = (canvas.place(flat, image.homography, at + d) for d in ((0, 0), (step, 0), (0, step)))
-        shown = np.isfinite(middle + right + down).all(axis=1)
-        jacobian = np.stack([right - middle, down - middle], axis=-1)[shown] / step
+        visible = np.isfinite(middle + right + down).all(axis=1)
+        jacobian = np.stack([right - middle, down - middle], axis=-1)[visible] / step
         magnification.append(np.linalg.svd(jacobian, compute_uv=False))
     every = np.concatenate(magnification)
     largest = float(every[:, 0].max() / np.median(every[:, 0]))

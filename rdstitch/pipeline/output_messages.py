@@ -18,8 +18,8 @@ def masked_messages(placed: PlacedImages) -> list[Message]:
     """What was left out of every image."""
     if placed.static is None:
         return []
-    share = float(placed.static.mean())
-    text = f"{share:.0%} of every image is black, or stays where it is, in all of them, and was masked"
+    fraction = float(placed.static.mean())
+    text = f"{fraction:.0%} of every image is black, or stays where it is, in all of them, and was masked"
     return [Message(text, severity="detail")]
 
 
@@ -27,11 +27,13 @@ def cut_away_messages(placed: PlacedImages, canvas: Canvas, options: CompositeOp
     """How much of the images has no place in the output."""
     if placed.grid is not None or options.like is not None or options.extent is not None:
         return []
-    share = canvas.cut_away(placed.cameras, placed.homographies)
-    text = f"{share:.0%} of what the images show is cut away: it would be stretched over {options.max_stretch:g} times"
+    fraction = canvas.cut_away(placed.cameras, placed.homographies)
+    text = (
+        f"{fraction:.0%} of what the images show is cut away: it would be stretched over {options.max_stretch:g} times"
+    )
     if placed.turned and canvas.projection == PLANE:
         text += "; --projection cylinder or sphere shows more"
-    return [Message(text, severity="note")] if share > Limits.visible_cut else []
+    return [Message(text, severity="note")] if fraction > Limits.visible_cut else []
 
 
 def place_messages(place: Georeference | None, reason: str, placed: PlacedImages) -> list[Message]:

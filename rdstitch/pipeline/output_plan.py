@@ -23,6 +23,8 @@ from rdstitch.system.output_checks import check_not_read, check_outputs, check_s
 from rdstitch.system.outputs import Outputs, text_bytes
 from rdstitch.viewer.page import viewer_path
 
+_REPORT_SUFFIXES = (".html", ".htm")
+
 
 @dataclass(frozen=True)
 class FileBeside:
@@ -142,7 +144,7 @@ def _files_beside(run: Run, names: Sequence[str]) -> Iterator[FileBeside]:
     """What is written beside an image of images with these names."""
     beside, outputs = run.beside, run.outputs
     if (report := beside.report) is not None:
-        yield FileBeside(report, partial(_write_report, run, report))
+        yield FileBeside(check_suffix(report, _REPORT_SUFFIXES), partial(_write_report, run, report))
     if (project := beside.hugin_project) is not None:
         yield FileBeside(project, partial(_write_hugin_project, project, outputs))
     if (table := beside.poses) is not None:

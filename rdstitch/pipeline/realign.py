@@ -28,7 +28,7 @@ def aligner_of(registration: Registration, options: StitchOptions, purpose: Purp
 
 def with_reference_of(registration: Registration, aligner: Aligner) -> Registration:
     """The pairs of a registration aligned anew, in the frame of the reference image of the aligner."""
-    return _aligned_anew(registration, aligner.align(registration.pairs), aligner, {})
+    return _aligned_anew(registration, aligner.align(registration.pairs), aligner)
 
 
 def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Alignment], bool]) -> Registration | None:
@@ -37,7 +37,7 @@ def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Al
         draft = aligner.draft(registration.used_pairs)
         if not wanted(draft.alignment):
             return None
-        return _aligned_anew(registration, aligner.completed(draft), aligner, {})
+        return _aligned_anew(registration, aligner.completed(draft), aligner)
     except RegistrationError:
         return None
 
@@ -79,7 +79,7 @@ def _with_pairs(registration: Registration, pairs: Sequence[PairRegistration], a
         aligned = aligner.align(pairs)
     except RegistrationError:
         return None
-    return _aligned_anew(replace(registration, pairs=tuple(aligner.used(aligned))), aligned, aligner, {})
+    return _aligned_anew(replace(registration, pairs=tuple(aligner.used(aligned))), aligned, aligner)
 
 
 def without(registration: Registration, rejected: Rejected, aligner: Aligner) -> Registration | None:
@@ -119,12 +119,12 @@ def _neighbours_of(rejected: Mapping[int, str], registration: Registration) -> d
 
 
 def _aligned_anew(
-    registration: Registration, aligned: AlignedPairs, aligner: Aligner, reasons: Mapping[int, str]
+    registration: Registration, aligned: AlignedPairs, aligner: Aligner, reasons: Mapping[int, str] | None = None
 ) -> Registration:
-    """The registration with another alignment, and why images are not in it."""
+    """The registration with another alignment, and why images are not in it, as far as that is known."""
     number = {path: k for k, path in enumerate(aligner.paths)}
     again = [message for message in registration.left_out if message.images[0] in number]  # the others were not read
-    known = {**reasons, **{number[m.images[0]]: m.text for m in again}}
+    known = {**(reasons or {}), **{number[m.images[0]]: m.text for m in again}}
     unused = explain_unaligned(aligned.alignment, aligner.paths, registration.keypoints, known)
     dropped = (*registration.alignment.messages, *again)
     whole = [message for message in registration.messages if message not in dropped]

@@ -95,8 +95,8 @@ def pano(
     (3, True)
     """
     run = Run.of(inputs, options, Purpose.PANO, output, beside=beside, every=every, progress=progress)
-    with run.found() as images:
-        return stitch_found(images, run)
+    with run.open_images() as images:
+        return stitch_images(images, run)
 
 
 @one_native_thread()
@@ -141,11 +141,11 @@ def mosaic(
     ('small.tif', np.True_)
     """
     run = Run.of(inputs, options, Purpose.MOSAIC, output, beside=beside, every=every, progress=progress)
-    with run.found() as images:
-        return stitch_found(images, run)
+    with run.open_images() as images:
+        return stitch_images(images, run)
 
 
-def stitch_found(
+def stitch_images(
     images: FoundImages, run: Run, *, more_images: Sequence[Path] = (), more_files: Sequence[Path] = ()
 ) -> StitchResult:
     """Stitch images that were found into an output of a run; more images, and files, may be written after it."""
@@ -199,7 +199,7 @@ def calibrate(
     """
     files = FilesBeside.of(ReportFile, beside, "calibrate")
     run = Run.of(inputs, options, Purpose.CALIBRATE, beside=files, every=every, progress=progress)
-    with run.found() as images:
+    with run.open_images() as images:
         OutputPlan.of_images(run, images.files).check()
         result = _registered(images, run)
         _save_camera(result, run)
@@ -248,7 +248,7 @@ def trajectory(
     check_parameter("frame", TrajectoryFrame | None, frame)
     options = replace(options_of(StitchOptions, options), pose_covariance=True)
     run = Run.of(inputs, options, Purpose.TRAJECTORY, every=every, progress=progress)
-    with run.found() as images:
+    with run.open_images() as images:
         OutputPlan.of_path(run, images.files, output, plot, layout).check()
         odometry = as_odometry(run.options.odometry)
         numbers = frame_numbers(images.frames)

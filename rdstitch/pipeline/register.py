@@ -7,7 +7,6 @@ from functools import partial
 from importlib import import_module
 
 from rdstitch.alignment import Alignment
-from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.sentences import explain_unaligned
 from rdstitch.features import LightGlue, match
 from rdstitch.inputs.positions import positions_of
@@ -64,8 +63,8 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
     moving = without_static_background(estimator, pairs, candidates)
     estimator, pairs = moving or (estimator, pairs)
     pairs = match_repeated_patterns(estimator, pairs) if purpose.lens_only else pairs
-    given = options.threshold, options.known_distortion
-    mixed, other_lens = separate_lenses(aligner.cameras, pairs, *given, executor)
+    threshold, distortion = options.threshold, options.known_distortion
+    mixed, other_lens = separate_lenses(aligner.cameras, pairs, threshold, distortion, executor)
     progress("aligning", 0, 1)
     pairs = [pair for pair in pairs if not {*pair.images} & other_lens.keys()]
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
@@ -78,36 +77,23 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
     settle = match_crossings if purpose.lens_only else settle_repeated_pattern
     aligned, undecided = settle(aligner, estimator, aligned, sources, detected.stretch, options.threads)
     unplaced = {**other_lens, **detected.damaged, **undecided}
+    alignment, keypoints = aligned.alignment, tuple(features.counts.tolist())
+    messages = [
+        *alignment.messages,
+        *([_STATIC_BACKGROUND] if moving else []),
+        *_low_contrast(detected.equalized, alignment, aligner.paths),
+        *explain_unaligned(alignment, aligner.paths, keypoints, unplaced),
+    ]
     return Registration(
         tuple(sources),
-        counts := tuple(features.counts.tolist()),
+        keypoints,
         tuple(aligner.used(aligned)),
-        aligned.alignment,
-        (
-            *aligned.alignment.messages,
-            *([_STATIC_BACKGROUND] if moving else []),
-            *_low_contrast(detected.equalized, aligned.alignment, aligner.paths),
-            *explain_unaligned(aligned.alignment, aligner.paths, counts, unplaced),
-        ),
+        alignment,
+        tuple(messages),
         static_background=moving is not None,
         stretch=detected.stretch,
         mixed=mixed,
     )
-
-
-def with_frontal_reference(registration: Registration, options: StitchOptions, *, always: bool) -> Registration:
-    """The same registration with an undistorted image as its plane; directions of a turn on the spot stay.
-
-    That is the reference image, unless it was chosen here and another one crosses its horizon. With ``always`` a
-    rectified plane, that of one camera's poses, gives way too.
-    """
-    alignment = registration.alignment
-    if alignment.on_sphere or (not always and alignment.poses is not None):
-        return registration
-    reference = alignment.reference if options.reference is not None else frontal_reference(alignment)
-    if not always and reference == alignment.reference:
-        return registration
-    return replace(registration, alignment=in_frame_of(alignment, reference))
 
 
 def _matching(options: StitchOptions) -> FeatureMatching:

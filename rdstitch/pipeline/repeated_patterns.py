@@ -58,13 +58,13 @@ def settle_repeated_pattern(
         return aligned, {}
     used = [pair for pair in aligned.pairs if pair.relation and alignment.used[[pair.image1, pair.image2]].all()]
     compared = sorted(used, key=lambda pair: pair.image2 - pair.image1)[: _PAIRS_OF_AN_IMAGE * len(sources)]
-    shown = ComparedImages(sources, stretch, workers).aligned(alignment, np.flatnonzero(alignment.used).tolist())
+    views = ComparedImages(sources, stretch, workers).aligned(alignment, np.flatnonzero(alignment.used).tolist())
     with ThreadPoolExecutor(workers) as pool:
-        ambiguities = pool.map(lambda pair: find_ambiguity(shown[pair.image1], shown[pair.image2]).ambiguous, compared)
+        ambiguities = pool.map(lambda pair: find_ambiguity(views[pair.image1], views[pair.image2]).ambiguous, compared)
         doubtful = [pair.images for pair, ambiguous in zip(compared, ambiguities, strict=True) if ambiguous]
     if not doubtful:
         return aligned, {}
-    shifts = unique_shifts(shown, doubtful, workers)
+    shifts = unique_shifts(views, doubtful, workers)
 
     def transfer(i: int, j: int, points: FloatArray) -> FloatArray:
         moved = to_plane(alignment.cameras[i], alignment.homographies[i], points) + shifts[i, j].shift

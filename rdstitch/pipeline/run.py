@@ -75,7 +75,7 @@ class Run:
         )
 
     @contextmanager
-    def found(self, *also_written: Path) -> Iterator[FoundImages]:
+    def open_images(self, *also_written: Path) -> Iterator[FoundImages]:
         """The images, none of which is among the outputs; in the end all that was staged is published."""
         written = [self.output, *also_written]
         with (

@@ -39,7 +39,8 @@ from rdstitch.stage.estimate_flat_field import agrees_with_overlaps
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.pair_candidates import SearchPlan
 from rdstitch.stage.positions import Scan, grid_from_arrays, grid_from_names, grid_from_table, grid_from_tiles
-from rdstitch.stage.register_tiles import TileRegistration, register_tiles
+from rdstitch.stage.register_tiles import LensEstimate, TileRegistration, register_tiles
+from rdstitch.stage.sentences import axes_contradicted
 from rdstitch.stage.tile_inputs import as_tiles, tile_frames
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, text_bytes
@@ -86,8 +87,8 @@ def tiles(
     options = with_fields(options_of(TileOptions, options), fields)
     files = FilesBeside.of(ImageFiles, beside, "tiles")
     run = replace(_tile_run(options, progress, output, files), inputs=as_tiles(inputs))
-    with run.found() as listed:
-        registration, plan = _registered(listed, run, options, positions_file)
+    with run.open_images() as images:
+        registration, plan = _registered(images, run, options, positions_file)
         with run.executor(len(registration.sources)) as executor:
             chosen = lay_out(registration, no_local_alignment("tiles on a stage"), options.composite)
             chosen = replace(chosen, plan=replace(chosen.plan, photographs=False))
@@ -134,26 +135,26 @@ def place_tiles(
     """
     options = with_fields(options_of(TileOptions, options), fields)
     run = replace(_tile_run(options, progress), inputs=as_tiles(inputs))
-    with run.found() as listed:
-        registration, _ = _registered(listed, run, options, positions_file)
+    with run.open_images() as images:
+        registration, _ = _registered(images, run, options, positions_file)
     assert registration.tiles is not None
     return registration.tiles, registration
 
 
 def _registered(
-    listed: FoundImages, run: Run, options: TileOptions, positions_file: str | Path | None
+    images: FoundImages, run: Run, options: TileOptions, positions_file: str | Path | None
 ) -> tuple[Registration, OutputPlan]:
     """The places of all tiles, once it is clear that everything can be written; their tables are, and what will be."""
     tables = [Path(file) for file in (positions_file, options.save_flat_field) if file is not None]
-    names = [frame.name for frame in listed.frames]
-    plan = OutputPlan.of_images(run, listed.files, names, more_files=tables)
+    names = [frame.name for frame in images.frames]
+    plan = OutputPlan.of_images(run, images.files, names, more_files=tables)
     plan.check()
-    frames, stored, notes = tile_frames(listed.frames, options.z, options.time)
+    frames, stored, notes = tile_frames(images.frames, options.z, options.time)
     limit = options.composite.max_memory
     sources, unread = read_sources(frames, skip_bad=not options.strict, guard=run.guard, max_memory=limit)
     plan.check_places(sources)
-    sources, odd = _of_one_kind(sources, options.strict)
-    unread += odd
+    sources, excluded = _of_one_kind(sources, options.strict)
+    unread += excluded
     while True:
         if len(sources) < 2:
             raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
@@ -169,7 +170,7 @@ def _registered(
     tiled = replace(tiled, z=options.z, time=options.time)
     _write_beside(run.outputs, positions_file, options, sources, tiled)
     registration = tiles_as_registration(sources, tiled)
-    return registration.with_messages([*unread, *listed.messages, *notes, *messages]), plan
+    return registration.with_messages([*unread, *images.messages, *notes, *messages]), plan
 
 
 def _of_one_kind(sources: list[Source], strict: bool) -> tuple[list[Source], list[Message]]:
@@ -179,27 +180,27 @@ def _of_one_kind(sources: list[Source], strict: bool) -> tuple[list[Source], lis
         count, planes = source.metadata.channels, source.metadata.planes
         kinds.append((count if planes else 3 if count > 2 else 1, source.metadata.bit_depth))
     usual = Counter(kinds).most_common(1)[0][0] if kinds else (1, 8)
-    left = []
+    excluded = []
     for source, kind in zip(sources, kinds, strict=True):
         if kind != usual:
             each = (f"{_channels(count)} of {bits}" for count, bits in (kind, usual))
             text = "has {} bits, but most tiles {}".format(*each)
             if strict:
                 raise InputError(f"{source.path}: {text}")
-            left.append(left_out(source.path, text))
-    return [source for source, kind in zip(sources, kinds, strict=True) if kind == usual], left
+            excluded.append(left_out(source.path, text))
+    return [source for source, kind in zip(sources, kinds, strict=True) if kind == usual], excluded
 
 
 def _readable(sources: Sequence[Source]) -> tuple[list[Source], list[Message]]:
     """The tiles that can be read, and why others cannot."""
-    good, bad = [], []
+    readable, unreadable = [], []
     for source in sources:
         try:
             source.read()
-            good.append(replace(source, flat_field=None))
+            readable.append(replace(source, flat_field=None))
         except InputError as error:
-            bad.append(left_out(source.path, str(error)))
-    return good, bad
+            unreadable.append(left_out(source.path, str(error)))
+    return readable, unreadable
 
 
 def _placed(
@@ -217,10 +218,12 @@ def _placed(
     plan = SearchPlan.of(nominal, options.search)
     factor = plan.factor
     grid, shown = with_measured_axes(nominal, lambda index: coarse_tile(read(index), factor), factor, plan.search)
-    messages = [Message(f"{nominal.source} contradicted: {shown}", code="grid-as-shown")] if shown else []
+    messages = [axes_contradicted(nominal.source, shown)] if shown else []
     if grid.pixel_size is not None:
         sources = [replace(s, metadata=replace(s.metadata, pixel_size=grid.pixel_size)) for s in sources]
-    tiled = register_tiles(replace(plan, grid=grid), read, distortion=options.distortion, progress=progress)
+    known = LensEstimate.FREE if options.distortion == "auto" else options.distortion
+    lens = LensEstimate.IF_SHOWN if known is None else known
+    tiled = register_tiles(replace(plan, grid=grid), read, distortion=lens, progress=progress)
     for index in set(range(len(grid))) - set(tiled.compared.ravel().tolist()):
         read(index)
     if options.flat_field == "auto" and sources[0].flat_field is not None and not _overlaps_show(sources, tiled):
@@ -279,22 +282,22 @@ def _channels(count: int) -> str:
 
 
 def _grid(
-    sources: Sequence[Source], listed: Sequence[Frame], stored: Mapping[Path, StoredTile], options: TileOptions
+    sources: Sequence[Source], frames: Sequence[Frame], stored: Mapping[Path, StoredTile], options: TileOptions
 ) -> TileGrid:
-    """Where the tiles should be; those of all that were listed that are left, which moves none of them."""
+    """Where the tiles should be; those of all that were named that are there, which moves none of them."""
     sizes = np.array([source.camera.image_size for source in sources], dtype=np.intp)
     width, height = sizes.max(axis=0).tolist()
     size, pixel_size = (width, height), options.pixel_size or sources[0].metadata.pixel_size
     names = [source.name for source in sources]
     if options.grid is not None:
         scan = Scan(options.columns, options.order, options.origin)
-        listed_names = [frame.name for frame in listed]
-        grid = grid_from_names(names, options.grid, options.overlap, size, scan, listed_names)
+        all_names = [frame.name for frame in frames]
+        grid = grid_from_names(names, options.grid, options.overlap, size, scan, all_names)
         grid = replace(grid, pixel_size=pixel_size)
     elif isinstance(options.positions, str | os.PathLike):
         grid = grid_from_table(names, options.positions, size, pixel_size)
     elif options.positions is not None:
-        lines = dict(zip(listed, frame_numbers(listed), strict=True))
+        lines = dict(zip(frames, frame_numbers(frames), strict=True))
         numbers = [lines[source.frame] for source in sources if source.frame is not None]
         grid = grid_from_arrays(options.positions, numbers, size, pixel_size, list(lines.values()))
     else:

@@ -103,31 +103,27 @@ def undistort(
     given = as_inputs(inputs, channel_order)
     file = camera if isinstance(camera, str | Path) else None
     lens, notes = read_camera(camera, given) if isinstance(camera, str | Path) else (camera, [])
-    with found_images(given, every=1, topic=topic) as listed:
-        guard = InputGuard()
+    guard = InputGuard()
+    with found_images(given, every=1, topic=topic) as listed, Outputs(overwrite) as outputs:
         sources, _ = read_sources(listed.frames, camera=lens, distortion=distortion, skip_bad=False, guard=guard)
         for message in (*notes, *listed.messages):
             warn(message)
-        if folder is None:
-            images = []
-            for done, source in enumerate(sources, start=1):
-                images.append(to_channel_order(_undistorted(source, view).pixels, channel_order))
-                progress("undistorting", done, len(sources))
-            for message in guard.messages:
-                warn(message)
-            return images
-        files = _files(sources, Path(folder), image_format)
-        with Outputs(overwrite) as outputs:
+        files, images = [], []
+        if folder is not None:
+            files = _files(sources, Path(folder), image_format)
             outputs.make_folder(Path(folder))
             check_outputs(files, overwrite, [*listed.files, *files_in(file)])
-            for done, (source, file) in enumerate(zip(sources, files, strict=True), start=1):
-                image = _undistorted(source, view)
+        for index, source in enumerate(sources):
+            image = _undistorted(source, view)
+            if folder is None:
+                images.append(to_channel_order(image.pixels, channel_order))
+            else:
                 metadata = source.metadata if view == "same" else source.metadata.in_another_size()
-                write_image(file, image.pixels, image.alpha, metadata=metadata, outputs=outputs)
-                progress("undistorting", done, len(sources))
-        for message in guard.messages:
-            warn(message)
-        return files
+                write_image(files[index], image.pixels, image.alpha, metadata=metadata, outputs=outputs)
+            progress("undistorting", index + 1, len(sources))
+    for message in guard.messages:
+        warn(message)
+    return images if folder is None else files
 
 
 def _undistorted(source: Source, view: Framing) -> Composite:

@@ -61,7 +61,7 @@ def _whole_shifts(registration: Registration) -> FloatArray | None:
     alignment = registration.alignment
     holding = {fit.images for fit in alignment.holding}
     number = np.cumsum(alignment.used) - 1
-    pairs, shifts, spread, left = [], [], [], []
+    pairs, shifts, spread, residuals = [], [], [], []
     for pair in registration.pairs:
         if pair.images not in holding:
             continue
@@ -76,7 +76,7 @@ def _whole_shifts(registration: Registration) -> FloatArray | None:
         pairs.append((number[pair.image1], number[pair.image2]))
         shifts.append(shift)
         spread.append(float(np.median(np.linalg.norm(fitted, axis=1))) / RAYLEIGH_MEDIAN / math.sqrt(len(moved)))
-        left.append((link.points1, whole, fitted))
+        residuals.append((link.points1, whole, fitted))
     if not pairs or max(spread) > _RESOLVED:
         return None
     first, second = np.array(pairs, dtype=np.intp).T
@@ -90,14 +90,14 @@ def _whole_shifts(registration: Registration) -> FloatArray | None:
     places = np.rint(tree.chained(motions, first, np.eye(3))[:, :2, 2])
     if (places[second] - places[first] != shifts).any():
         return None
-    points, whole, fitted = (np.concatenate(parts) for parts in zip(*left, strict=True))
+    points, whole, fitted = (np.concatenate(parts) for parts in zip(*residuals, strict=True))
     evidence = Evidence.of(
-        np.repeat(np.arange(len(left)), [len(part) for part, *_ in left]),
+        np.repeat(np.arange(len(residuals)), [len(part) for part, *_ in residuals]),
         points,
-        np.zeros(len(left), dtype=np.intp),
+        np.zeros(len(residuals), dtype=np.intp),
         np.array([float(np.median(np.linalg.norm(fitted, axis=1))) / RAYLEIGH_MEDIAN]),
         np.array([alignment.cameras[alignment.reference].scale]),
-        np.array([min(1.0, (len(places) - 1) / len(left))]),
+        np.array([min(1.0, (len(places) - 1) / len(residuals))]),
     )
     by_model = evidence.cost(fitted, _FREEDOM * (len(places) - 1))
     return places if evidence.cost(whole, 0)[0] <= by_model[0] else None

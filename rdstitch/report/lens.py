@@ -1,12 +1,14 @@
 """The lens: its curve over the radius, where matches support it, and each pair's λ."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from rdstitch.alignment.lens.lens_description import describe_lens, radius_std
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.distortion_consensus import Consensus, vote
-from rdstitch.report.pairs import residuals
+from rdstitch.report.pairs import LinkResiduals
 from rdstitch.report.svg import BLUE, RED, Markup, counted, drawing, element, label, line, polyline, section
 from rdstitch.results.registration import Registration
 
@@ -19,14 +21,14 @@ _TICKS = 6
 _BINS = 50  # of the histogram of votes
 
 
-def _across(shares: FloatArray, texts: list[str], title: str) -> list[Markup]:
-    """Texts along the horizontal axis, at shares of its length, and its title."""
-    x = _LEFT + shares * (_RIGHT - _LEFT)
+def _across(fractions: FloatArray, texts: list[str], title: str) -> list[Markup]:
+    """Texts along the horizontal axis, at fractions of its length, and its title."""
+    x = _LEFT + fractions * (_RIGHT - _LEFT)
     ticks = [label(float(at), _BASE + 16, text, text_anchor="middle") for at, text in zip(x, texts, strict=True)]
     return [*ticks, label(_WIDTH / 2, _HEIGHT - 6, title, text_anchor="middle")]
 
 
-def lens_curve(registration: Registration) -> str:
+def lens_curve(registration: Registration, residuals: Sequence[LinkResiduals]) -> str:
     """Measured radii of the lens against those of the nearest one-parameter lens, with uncertainty and support."""
     alignment, camera = registration.alignment, registration.upright_camera
     farthest = float(np.linalg.norm(camera.normalize(camera.outline(1)), axis=1).max())
@@ -34,21 +36,20 @@ def lens_curve(registration: Registration) -> str:
         "Lens curve",
         "How many pixels farther from the distortion centre the lens measures a ray than the one-parameter lens with "
         f"λ = {alignment.distortion:.4f} (red) does, with twice the standard deviation on either side. "
-        f"{_support(camera, _places(registration), farthest)}",
+        f"{_support(camera, _matched_points(camera, residuals), farthest)}",
         element("ul", (element("li", text) for text in describe_lens(alignment, camera))),
         _curve(camera, np.linspace(0.0, farthest, _SAMPLES + 1)[1:]),
     )
 
 
-def _places(registration: Registration) -> FloatArray:
-    """Give where the matches that agree with the alignment are, pixels of images of the reference's size, (N, 2)."""
-    camera = registration.upright_camera
-    places = [camera.denormalize(other.normalize(measured)) for other, measured, _ in residuals(registration)]
-    return np.concatenate([np.empty((0, 2)), *places])
+def _matched_points(camera: Camera, residuals: Sequence[LinkResiduals]) -> FloatArray:
+    """Where the matches that agree with the alignment are, pixels of images of one camera's size, (N, 2)."""
+    points = [camera.denormalize(link.camera.normalize(link.points)) for link in residuals]
+    return np.concatenate([np.empty((0, 2)), *points])
 
 
 def _support(camera: Camera, places: FloatArray, farthest: float) -> str:
-    """Give where in the image there are matches, one sentence."""
+    """Where in the image there are matches, one sentence."""
     if not len(places):
         return "No match supports it."
     across, down = _CELLS
@@ -57,9 +58,9 @@ def _support(camera: Camera, places: FloatArray, farthest: float) -> str:
     seen[cell[:, 1], cell[:, 0]] = True
     reach = float(np.quantile(np.linalg.norm(camera.normalize(places), axis=1), 0.99)) / farthest
     corners = ("top left", (0, 0)), ("top right", (0, -1)), ("bottom left", (-1, 0)), ("bottom right", (-1, -1))
-    bare = [name for name, place in corners if not seen[place]]
+    empty = [name for name, place in corners if not seen[place]]
     text = f"{len(places)} matches lie in {seen.mean():.0%} of the image, up to {reach:.0%} of the way to its corner."
-    return text + (f" None lie in the corner {', '.join(bare)}: there the lens is extrapolated." if bare else "")
+    return text + (f" None lie in the corner {', '.join(empty)}: there the lens is extrapolated." if empty else "")
 
 
 def _curve(camera: Camera, radii: FloatArray) -> str:
@@ -71,7 +72,7 @@ def _curve(camera: Camera, radii: FloatArray) -> str:
         return np.column_stack([x, middle - values / high * (_BASE - _TOP) / 2.0])
 
     band = np.concatenate([at(difference + spread), at(difference - spread)[::-1]])
-    shares = np.linspace(0.0, 1.0, _TICKS)
+    fractions = np.linspace(0.0, 1.0, _TICKS)
     parts = [
         polyline(band, closed=True, fill=BLUE, fill_opacity=0.2, stroke="none"),
         line((_LEFT, middle), (_RIGHT, middle), stroke=RED, stroke_width=1.5),
@@ -80,7 +81,9 @@ def _curve(camera: Camera, radii: FloatArray) -> str:
             label(_LEFT - 6, y + 4, f"{value:+.2f}" if value else "0", text_anchor="end")
             for value, y in ((high, _TOP), (0.0, middle), (-high, _BASE))
         ),
-        *_across(shares, [f"{r:.0f}" for r in shares * radii[-1] * camera.scale], "pixels from the distortion centre"),
+        *_across(
+            fractions, [f"{r:.0f}" for r in fractions * radii[-1] * camera.scale], "pixels from the distortion centre"
+        ),
         label(_LEFT, _TOP - 8, "pixels farther out than the one-parameter lens"),
     ]
     return drawing(_WIDTH, _HEIGHT, parts, "the lens against the one-parameter lens")
@@ -107,16 +110,16 @@ def votes(registration: Registration) -> str:
 def _histogram(adjusted: float, consensus: Consensus) -> str:
     values, center = consensus.votes, consensus.distortion
     span = min(values.min(), center - 1e-3), max(values.max(), center + 1e-3)
-    shares, places = np.histogram(values, bins=_BINS, range=span, weights=consensus.std_of_votes**-2.0)
-    shares = shares / shares.sum()
+    weights, places = np.histogram(values, bins=_BINS, range=span, weights=consensus.std_of_votes**-2.0)
+    weights = weights / weights.sum()
     low, high = min(places[0], adjusted), max(places[-1], adjusted)
     low, high = low - 0.02 * (high - low), high + 0.02 * (high - low)
     *edges, at = (_LEFT + (np.r_[places, adjusted] - low) / (high - low) * (_RIGHT - _LEFT)).tolist()
-    heights = (shares / shares.max() * (_BASE - _TOP)).tolist()
+    heights = (weights / weights.max() * (_BASE - _TOP)).tolist()
     parts = [
-        element("rect", x=left, y=_BASE - tall, width=max(right - left - 0.5, 0.5), height=tall, fill=BLUE)
-        for left, right, tall in zip(edges, edges[1:], heights, strict=False)
-        if tall > 0.0
+        element("rect", x=left, y=_BASE - height, width=max(right - left - 0.5, 0.5), height=height, fill=BLUE)
+        for left, right, height in zip(edges, edges[1:], heights, strict=False)
+        if height > 0.0
     ]
     digits = max(2, int(np.ceil(-np.log10((high - low) / _TICKS))) + 1)
     parts += [
@@ -127,6 +130,6 @@ def _histogram(adjusted: float, consensus: Consensus) -> str:
             [f"{tick:.{digits}f}" for tick in np.linspace(low, high, _TICKS)],
             "λ (half diagonal)",
         ),
-        label(_LEFT, _TOP - 8, f"weight, up to {shares.max():.0%}"),
+        label(_LEFT, _TOP - 8, f"weight, up to {weights.max():.0%}"),
     ]
     return drawing(_WIDTH, _HEIGHT, parts, "votes on λ")

@@ -55,11 +55,11 @@ def mosaic_section(result: StitchResult, file: Path | None) -> str:
     return section("Mosaic", text, _broken_seams(result), shown)
 
 
-def seam_dots(seams: SeamQuality, scale: float, apart: float) -> list[tuple[float, float, bool]]:
-    """Places along seams, pixels of a drawing, and whether broken: one in each cell of a side ``apart``."""
+def seam_dots(seams: SeamQuality, scale: float, spacing: float) -> list[tuple[float, float, bool]]:
+    """Places along seams, pixels of a drawing, and whether broken: one in each cell of side ``spacing``."""
     at = (seams.places + 0.5) * scale
     order = np.argsort(~seams.broken, kind="stable")
-    _, first = np.unique((at[order] // apart).astype(np.int64), axis=0, return_index=True)
+    _, first = np.unique((at[order] // spacing).astype(np.int64), axis=0, return_index=True)
     return [(float(at[k, 0]), float(at[k, 1]), bool(seams.broken[k])) for k in np.sort(order[first])]
 
 

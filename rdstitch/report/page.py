@@ -11,7 +11,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.georeferencing.georeference import map_summary
 from rdstitch.report.lens import lens_curve, votes
 from rdstitch.report.mosaic import mosaic_section
-from rdstitch.report.pairs import match_graph, matched, residual_map
+from rdstitch.report.pairs import link_residuals, match_graph, matched, residual_map
 from rdstitch.report.stage import stage_section
 from rdstitch.report.svg import Content, Markup, element, joined, of_source, section, table
 from rdstitch.results.messages import merge_by_reason, of_severity
@@ -90,6 +90,7 @@ def report_page(
     title, image = "rdstitch report", None
     if stitched is not None and stitched.output is not None:
         title, image = stitched.output.name, where(stitched.output)
+    residuals = link_residuals(registration)
     body: list[Content] = [
         summary(registration, stitched),
         notices(registration),
@@ -101,9 +102,9 @@ def report_page(
         ),
         match_graph(registration),
         votes(registration),
-        lens_curve(registration),
+        lens_curve(registration, residuals),
         matched(registration),
-        residual_map(registration),
+        residual_map(registration, residuals),
         run_section(stages, command),
     ]
     head = Markup(f'<meta charset="utf-8"><meta name="viewport" content="{_VIEWPORT}"><style>{_STYLE}</style>')

@@ -1,6 +1,7 @@
 """The pairs: over the outlines of the images, the best and the worst one, and what the model leaves over."""
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,6 +40,14 @@ _MIN_MATCHES = 4  # matches in a cell that make a mean
 _ARROW = 0.9  # of a cell's width, for the largest mean
 
 
+class LinkResiduals(NamedTuple):
+    """How well the inliers of a link agree with the alignment."""
+
+    camera: Camera  # of its second image
+    points: FloatArray  # (N, 2): where they are in that, pixels
+    errors: FloatArray  # (N, 2): how far the alignment puts them from there, pixels
+
+
 def match_graph(registration: Registration) -> str:
     """Outlines of all images, and a line for each pair: thick where there are many matches, red where errors are."""
     alignment = registration.alignment
@@ -57,12 +66,12 @@ def match_graph(registration: Registration) -> str:
     links = alignment.holding
     by_error = sorted(links, key=lambda fit: fit.rms)
     for fit in (by_error[k] for k in evenly_spaced(len(links), _MAX_LINKS)):
-        share = float(np.nan_to_num(np.clip(fit.rms / alignment.rms - 0.75, 0.0, 1.0)))
+        excess = float(np.nan_to_num(np.clip(fit.rms / alignment.rms - 0.75, 0.0, 1.0)))
         names = " and ".join(registration.sources[k].name for k in fit.images)
         title = element("title", f"{names}: {fit.inliers} of {fit.count} matches, {fit.rms:.2f} pixels")
         start, end = ((centers[k] + shift) * scale for k in fit.images)
         thickness = float(np.clip(np.log10(fit.inliers + 1.0), 0.5, 4.0))
-        parts.append(line(start, end, title, stroke=_mixed(share), stroke_width=thickness))
+        parts.append(line(start, end, title, stroke=_mixed(excess), stroke_width=thickness))
     for index, center in centers.items():
         x, y = ((center + shift) * scale).tolist()
         name, fill = registration.sources[index].name, RED if index == alignment.reference else GREY
@@ -78,10 +87,10 @@ def match_graph(registration: Registration) -> str:
     )
 
 
-def _mixed(share: float) -> str:
+def _mixed(fraction: float) -> str:
     """From green at 0 to red at 1."""
     low, high = ([int(colour[k : k + 2], 16) for k in (1, 3, 5)] for colour in (GREEN, RED))
-    return "#" + "".join(f"{round(a + share * (b - a)):02x}" for a, b in zip(low, high, strict=True))
+    return "#" + "".join(f"{round(a + fraction * (b - a)):02x}" for a, b in zip(low, high, strict=True))
 
 
 def matched(registration: Registration) -> str:
@@ -116,16 +125,17 @@ def _pair(registration: Registration, title: str, fit: LinkFit) -> str:
             if image is None
             else element("image", href=image, opacity=_FADED, **place)
         )
-    matched_points = pair.correspondences.points1, pair.correspondences.points2
-    ends = [(p + 0.5) * scale + (left, 0.0) for p, scale, left in zip(matched_points, scales, lefts, strict=True)]
+    matched = pair.correspondences
+    points = zip((matched.points1, matched.points2), scales, lefts, strict=True)
+    ends = [(measured + 0.5) * scale + (left, 0.0) for measured, scale, left in points]
     inliers = pair.relation.inliers
     parts += _match_lines(ends[0][~inliers], ends[1][~inliers], RED, 0.25)
     parts += _match_lines(ends[0][inliers], ends[1][inliers], GREEN, 0.6)
-    tall = max(height * scale for (_, height), scale in zip(sizes, scales, strict=True))
+    drawn_height = max(height * scale for (_, height), scale in zip(sizes, scales, strict=True))
     names = " and ".join(source.name for source in sources)
     agree = f"{fit.inliers} of {int(inliers.sum())} inliers fit the result, rms {fit.rms:.2f} pixels"
     text = f"{title}: {names}; {agree}"
-    return joined(element("h3", text), drawing(2 * _IMAGE_WIDTH + _IMAGE_GAP, tall, parts, text))
+    return joined(element("h3", text), drawing(2 * _IMAGE_WIDTH + _IMAGE_GAP, drawn_height, parts, text))
 
 
 def _match_lines(starts: FloatArray, stops: FloatArray, colour: str, opacity: float) -> list[Markup]:
@@ -135,24 +145,23 @@ def _match_lines(starts: FloatArray, stops: FloatArray, colour: str, opacity: fl
     return [line(start, stop, stroke=colour, stroke_opacity=opacity) for start, stop in ends]
 
 
-def residual_map(registration: Registration) -> str:
+def residual_map(registration: Registration, residuals: Sequence[LinkResiduals]) -> str:
     """Errors of all pairs over the area of the image: rms as grey, mean as an arrow."""
-    errors = residuals(registration)
-    if not errors:
+    if not residuals:
         return section("Residuals", "There are none.")
     # Images of several sizes are laid over one another.
-    places = np.concatenate([(measured + 0.5) / camera.image_size for camera, measured, _ in errors])
-    off = np.concatenate([residual for *_, residual in errors])
+    places = np.concatenate([(link.points + 0.5) / link.camera.image_size for link in residuals])
+    error = np.concatenate([link.errors for link in residuals])
     width, height = registration.upright_camera.image_size
     rows = max(1, round(_COLUMNS * height / width))
     cell = np.clip((places * (_COLUMNS, rows)).astype(int), 0, (_COLUMNS - 1, rows - 1)) @ (1, _COLUMNS)
     cells = _COLUMNS * rows
     count = np.bincount(cell, minlength=cells)
-    mean = np.stack([np.bincount(cell, off[:, k], cells) for k in (0, 1)], axis=1) / np.maximum(count, 1)[:, None]
-    rms = np.sqrt(np.bincount(cell, (off**2).sum(axis=1), cells) / np.maximum(count, 1))
+    mean = np.stack([np.bincount(cell, error[:, k], cells) for k in (0, 1)], axis=1) / np.maximum(count, 1)[:, None]
+    rms = np.sqrt(np.bincount(cell, (error**2).sum(axis=1), cells) / np.maximum(count, 1))
     enough = count >= _MIN_MATCHES
     if not enough.any():
-        return section("Residuals", f"There are too few matches ({len(off)}) to draw them over the image.")
+        return section("Residuals", f"There are too few matches ({len(error)}) to draw them over the image.")
     side, darkest = _MAP_WIDTH / _COLUMNS, float(rms[enough].max())
     longest = max(float(np.linalg.norm(mean[enough], axis=1).max()), 1e-9)
     parts = [
@@ -171,14 +180,14 @@ def residual_map(registration: Registration) -> str:
         start = np.array([(x + 0.5) * side, (y + 0.5) * side])
         ends = start - tip / 2, start + tip / 2
         parts.append(line(*ends, stroke=RED, stroke_width=1.5, marker_end="url(#residual)"))
-    tall = rows * side
+    map_height = rows * side
     text = f"darkest cell: rms {darkest:.2f} pixels; longest arrow: mean of {longest:.2f} pixels in that direction"
-    parts.append(label(0.0, tall + 16, text))
+    parts.append(label(0.0, map_height + 16, text))
     return section(
         "Residuals",
-        f"{len(off)} inliers of all pairs over the area of the image. Arrows that follow a pattern tell of something "
+        f"{len(error)} inliers of all pairs over the area of the image. Arrows that follow a pattern tell of something "
         "that the model does not describe: relief, a rolling shutter, a lens that one λ is not enough for.",
-        drawing(_MAP_WIDTH, tall + 22, parts, "residuals over the image"),
+        drawing(_MAP_WIDTH, map_height + 22, parts, "residuals over the image"),
     )
 
 
@@ -194,21 +203,17 @@ def image_centre(registration: Registration, index: int) -> FloatArray:
     return _on_plane(registration, index, np.array([[(width - 1) / 2, (height - 1) / 2]])).reshape(2)
 
 
-def residuals(registration: Registration) -> list[tuple[Camera, FloatArray, FloatArray]]:
-    """Of each link the camera of its second image, where the inliers are in it, and how far the alignment puts them
-    from there, pixels; without those that miss by more than four times the link's error.
-    """
+def link_residuals(registration: Registration) -> list[LinkResiduals]:
+    """Of each link that is used; without the inliers that miss by more than four times its error."""
     alignment, pairs = registration.alignment, {pair.images: pair for pair in registration.pairs}
-    found = []
+    residuals = []
     for fit in alignment.links:
         if fit.used and fit.rms > 0.0:
-            pair = pairs[fit.images]
-            inliers = pair.relation.inliers
-            given, measured = pair.correspondences.points1[inliers], pair.correspondences.points2[inliers]
-            off = alignment.transfer(*fit.images, given) - measured
-            kept = np.linalg.norm(off, axis=1) <= 4.0 * fit.rms
-            found.append((alignment.cameras[fit.image2], measured[kept], off[kept]))
-    return found
+            link = pairs[fit.images].link()
+            errors = alignment.transfer(*fit.images, link.points1) - link.points2
+            kept = np.linalg.norm(errors, axis=1) <= 4.0 * fit.rms
+            residuals.append(LinkResiduals(alignment.cameras[fit.image2], link.points2[kept], errors[kept]))
+    return residuals
 
 
 def _on_plane(registration: Registration, index: int, points: FloatArray) -> FloatArray:

@@ -60,12 +60,12 @@ def left_out(path: str | Path, reason: str) -> Message:
 
 def merge_by_reason(messages: Iterable[Message]) -> list[Message]:
     """The same; images left out for the same reason are named in one, each once, which stands where the first did."""
-    told: dict[object, Message] = {}
+    merged: dict[object, Message] = {}
     for number, message in enumerate(messages):
         key = message.text if message.severity == "left out" else number
-        images = (*told[key].images, *message.images) if key in told else message.images
-        told[key] = replace(message, images=tuple(dict.fromkeys(images)))
-    return list(told.values())
+        images = (*merged[key].images, *message.images) if key in merged else message.images
+        merged[key] = replace(message, images=tuple(dict.fromkeys(images)))
+    return list(merged.values())
 
 
 def of_severity(messages: Iterable[Message], *severities: Severity) -> tuple[Message, ...]:

@@ -13,6 +13,7 @@ from rdstitch.compositing import Canvas, Composite, CompositePlan, FileComposite
 from rdstitch.errors import ArgumentError
 from rdstitch.georeferencing.georeference import Georeference
 from rdstitch.inputs.frame import to_channel_order
+from rdstitch.io.fingerprint import Fingerprint
 from rdstitch.io.preview import encode_preview, read_preview
 from rdstitch.io.read import read_image
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
@@ -20,7 +21,6 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.registration import Registration, Verdict
-from rdstitch.system.outputs import Fingerprint
 
 _PREVIEW = 800  # pixels of the longer side
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,8 +30,12 @@ _TOKEN = re.compile(r"\d+|[^\W\d_]+|[\W_]+")
 Chosen = list[Frame | None]
 """For each image of the registration the frame that takes its place."""
 
-_Known = tuple[float | None, GpsPosition | None]
-"""When and where an image was taken."""
+
+class _Taken(NamedTuple):
+    """When, s, and where an image was taken, as far as that is known."""
+
+    time: float | None = None
+    position: GpsPosition | None = None
 
 
 def counterparts(
@@ -50,16 +55,15 @@ def counterparts(
         ("position", lambda: _by_measurement(saved, frames, _metres)),
     )
     for matched, find in ways[:3] if match == "name" else ways:
-        found = find() or [None] * len(saved.images)
-        pairs = zip(saved.images, found, strict=True)
-        chosen = [None if image.to_plane is None else frame for image, frame in pairs]
+        of_all = find() or [None] * len(saved.images)
+        chosen = [frame if image.used else None for image, frame in zip(saved.images, of_all, strict=True)]
         if any(frame is not None for frame in chosen):
             if matched == "name" and match == "auto":
                 _refuse_other_flights(saved, chosen)
-            return chosen, matched, _without_counterpart(found, frames)
+            return chosen, matched, _without_counterpart(of_all, frames)
     for path in files_of(frames):
         check_readable(path)
-    wanted = next(image.name for image in saved.images if image.to_plane is not None)
+    wanted = next(image.name for image in saved.images if image.used)
     by = "has the name of a registered image" if match == "name" else "fits a registered image by name, time or GPS"
     raise InputError(f"{saved.path}: none of the given images {by} ({wanted}, …); --match order takes them in order")
 
@@ -80,17 +84,17 @@ def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[P
     chosen, taken = list[Frame | None](), set[int]()
     for image in saved.images:
         *folders, name = Path(canonical_text(image.name)).parts or ("",)
-        alike = given.get(key(Path(name)), [])
+        namesakes = given.get(key(Path(name)), [])
         if folders:
-            alike = [frame for frame in alike if _folders(frame)[-len(folders) :] == folders]
-        if image.to_plane is not None and (len(alike) > 1 or taken.intersection(map(id, alike))):
+            namesakes = [frame for frame in namesakes if _folders(frame)[-len(folders) :] == folders]
+        if image.used and (len(namesakes) > 1 or taken.intersection(map(id, namesakes))):
             raise InputError(
                 f"{saved.path}: several images are called {name}; give as many images as were registered, in the same "
                 "order, with --match order"
             )
-        if image.to_plane is not None:
-            taken.update(map(id, alike))
-        chosen.append(alike[0] if alike else None)
+        if image.used:
+            taken.update(map(id, namesakes))
+        chosen.append(namesakes[0] if namesakes else None)
     return chosen
 
 
@@ -112,12 +116,12 @@ def _folders(frame: Frame) -> list[str]:
 
 def _by_varying_part(saved: SavedRegistration, frames: Sequence[Frame]) -> Chosen | None:
     """By what differs between names of one side, as of V07_RED.jpg and V07_NIR.jpg."""
-    ours = _varying_parts([image.name for image in saved.images])
-    theirs = _varying_parts([without_query(frame.path).name for frame in frames])
-    if ours is None or theirs is None or not set(ours) & set(theirs):
+    registered = _varying_parts([image.name for image in saved.images])
+    given = _varying_parts([without_query(frame.path).name for frame in frames])
+    if registered is None or given is None or not set(registered) & set(given):
         return None
-    files = dict(zip(theirs, frames, strict=True))
-    return [files.get(part) for part in ours]
+    frame_of = dict(zip(given, frames, strict=True))
+    return [frame_of.get(part) for part in registered]
 
 
 def _varying_parts(names: Sequence[str]) -> list[tuple[str, ...]] | None:
@@ -130,46 +134,41 @@ def _varying_parts(names: Sequence[str]) -> list[tuple[str, ...]] | None:
     return keys if max(Counter(keys).values()) == 1 else None
 
 
-def _seconds(ours: Sequence[_Known], theirs: Sequence[_Known]) -> tuple[FloatArray, FloatArray]:
-    each = [np.array([np.nan if time is None else time for time, _ in known]) for known in (ours, theirs)]
-    return each[0][:, None], each[1][:, None]
+def _seconds(taken: Sequence[_Taken]) -> FloatArray:
+    return np.array([[np.nan if one.time is None else one.time] for one in taken])
 
 
-def _metres(ours: Sequence[_Known], theirs: Sequence[_Known]) -> tuple[FloatArray, FloatArray]:
-    both = metres_around_median([position for _, position in (*ours, *theirs)])
-    return both[: len(ours)], both[len(ours) :]
+def _metres(taken: Sequence[_Taken]) -> FloatArray:
+    return metres_around_median([one.position for one in taken])
 
 
 def _by_measurement(
-    saved: SavedRegistration,
-    frames: Sequence[Frame],
-    measure: Callable[[Sequence[_Known], Sequence[_Known]], tuple[FloatArray, FloatArray]],
+    saved: SavedRegistration, frames: Sequence[Frame], measure: Callable[[Sequence[_Taken]], FloatArray]
 ) -> Chosen | None:
     """By what is nearer than half the way to the next registered image; None where most have no such counterpart."""
     if any(frame.image is not None or frame.number is not None for frame in frames):
         return None
-    here, there = measure(list(map(_known_of, saved.images)), list(map(_known_of_frame, frames)))
-    used = np.array([image.to_plane is not None for image in saved.images])
-    here = np.where(used[:, None], here, np.nan)
-    known, given = (np.flatnonzero(np.isfinite(one).all(axis=1)) for one in (here, there))
-    if len(known) < 2 or not len(given):
+    count, used = len(saved.images), np.array([image.used for image in saved.images])
+    measured = measure([*map(_taken_image, saved.images), *map(_taken_frame, frames)])
+    registered, given = np.where(used[:, None], measured[:count], np.nan), measured[count:]
+    known, known_given = (np.flatnonzero(np.isfinite(rows).all(axis=1)) for rows in (registered, given))
+    if len(known) < 2 or not len(known_given):
         return None
-    reach = nearest_points(here[known], here[known], 2)[0][:, 1] / 2.0
-    distance, index = (found[:, 0] for found in nearest_points(there[given], here[known], 1))
-    nearest = dict(zip(known[distance < reach].tolist(), given[index[distance < reach]].tolist(), strict=True))
+    reach = nearest_points(registered[known], registered[known], 2)[0][:, 1] / 2.0
+    distance, index = (columns[:, 0] for columns in nearest_points(given[known_given], registered[known], 1))
+    within = distance < reach
+    nearest = dict(zip(known[within].tolist(), known_given[index[within]].tolist(), strict=True))
     counts = Counter(nearest.values())
-    taken = (nearest.get(k) for k in range(len(here)))
-    chosen = [None if k is None or counts[k] > 1 else frames[k] for k in taken]
+    chosen = [frames[nearest[k]] if k in nearest and counts[nearest[k]] == 1 else None for k in range(count)]
     return chosen if 2 * sum(frame is not None for frame in chosen) > used.sum() else None
 
 
-def _known_of(image: ImageRecord) -> _Known:
-    """Of a registered image."""
-    return image.timestamp, None if image.gps is None else GpsPosition(*image.gps)
+def _taken_image(image: ImageRecord) -> _Taken:
+    return _Taken(image.timestamp, None if image.gps is None else GpsPosition(*image.gps))
 
 
-def _known_of_frame(frame: Frame) -> _Known:
-    return (None, None) if frame.metadata is None else (frame.metadata.timestamp, frame.metadata.gps)
+def _taken_frame(frame: Frame) -> _Taken:
+    return _Taken() if frame.metadata is None else _Taken(frame.metadata.timestamp, frame.metadata.gps)
 
 
 def _with_header(frame: Frame) -> Frame:

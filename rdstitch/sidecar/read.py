@@ -13,11 +13,11 @@ from rdstitch.arrays import FloatArray
 from rdstitch.compositing import CompositeOptions
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.georeferencing.georeference import Georeference
+from rdstitch.io.fingerprint import Fingerprint, fingerprint
 from rdstitch.sidecar.image_record import ImageRecord
 from rdstitch.sidecar.records import VERSION, SidecarRecord
 from rdstitch.system.file_access import read_text
 from rdstitch.system.output_checks import tiles_folder
-from rdstitch.system.outputs import Fingerprint, fingerprint
 from rdstitch.system.records import Matrix, convert, parse_json
 
 _OF_A_MACHINE = ("max_memory", "workers")  # options that the machine that wrote a sidecar had, not the picture
@@ -35,7 +35,6 @@ class SavedRegistration:
     path: Path  # of the sidecar
     record: SidecarRecord
     composite: CompositeOptions  # what the image was composited with
-    output_place: Georeference | None  # of the output's pixels, where that was georeferenced
 
     @property
     def images(self) -> Sequence[ImageRecord]:
@@ -70,9 +69,8 @@ class SavedRegistration:
     @property
     def place(self) -> Georeference | None:
         """Of the plane, where the output was georeferenced."""
-        if self.output_place is None or self.plane_to_output is None:
-            return None
-        return self.output_place.after(np.linalg.inv(self.plane_to_output).astype(np.float64))
+        place, to_output = self.record.output.place, self.plane_to_output
+        return None if place is None or to_output is None else place.after(np.linalg.inv(to_output).astype(np.float64))
 
 
 def _array(matrix: Matrix | None) -> FloatArray | None:
@@ -85,11 +83,7 @@ def read_sidecar(path: str | Path) -> SavedRegistration:
     if isinstance(content, dict) and isinstance(version := content.get("version"), int) and version > VERSION:
         raise InputError(f"{path}: version: this rdstitch reads versions 1 to {VERSION} of sidecars, not {version}")
     record = convert(content, SidecarRecord, file)
-    composite = _composite_options(record, file)
-    try:
-        return SavedRegistration(Path(path), record, composite, record.output.place)
-    except ArgumentError as error:
-        raise InputError(f"{path}: output.georeference.crs: {error}") from error
+    return SavedRegistration(Path(path), record, _composite_options(record, file))
 
 
 def _composite_options(record: SidecarRecord, file: str) -> CompositeOptions:

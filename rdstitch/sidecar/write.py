@@ -8,7 +8,7 @@ from typing import Any, cast
 import cv2
 import numpy as np
 
-from rdstitch.geometry.camera_record import camera_record
+from rdstitch.geometry.camera_record import CameraRecord, camera_record
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.image_record import ImageRecord, PoseRecord, image_fields, placement_fields
 from rdstitch.sidecar.output_record import OutputRecord, SeamsRecord
@@ -29,23 +29,17 @@ from rdstitch.system.records import to_jsonable
 def sidecar(result: StitchResult) -> dict[str, Any]:
     """The sidecar's content, as docs/formats.md describes it; every number that does not exist is null."""
     registration, alignment = result.registration, result.registration.alignment
-    camera = camera_record(registration.camera)
     fits = {fit.images: fit for fit in alignment.links}
     names = [source.name for source in registration.sources]
     record = SidecarRecord(
         format="rdstitch sidecar",
         version=VERSION,
-        lambda_=alignment.distortion,
         lambda_std=alignment.distortion_std,
-        lambda_px=registration.camera.distortion_px,
-        lambda_focal=registration.camera.distortion_focal,
         lambda_known=alignment.lens_given,
         lens=cast(Lens, alignment.lens),
         lens_reason=alignment.lens_reason,
-        camera=camera,
         tilt_deg=None if alignment.tilt is None else np.degrees(alignment.tilt).tolist(),
-        focal_px=registration.camera.focal,
-        focal_source=registration.camera.focal_source,
+        **camera_fields(camera_record(registration.camera)),
         model=cast(Model, alignment.model),
         model_reason=alignment.model_reason,
         rms_px=alignment.rms,
@@ -63,6 +57,12 @@ def sidecar(result: StitchResult) -> dict[str, Any]:
     )
     content: dict[str, Any] = to_jsonable(record)
     return content
+
+
+def camera_fields(camera: CameraRecord) -> dict[str, Any]:
+    """The fields of a sidecar that say what the camera of its reference image is."""
+    of_lens = ("lambda_", "lambda_px", "lambda_focal", "focal_px", "focal_source")
+    return {"camera": camera, **{name: getattr(camera, name) for name in of_lens}}
 
 
 def _images(result: StitchResult) -> list[ImageRecord]:

@@ -14,7 +14,7 @@ from rdstitch.sidecar.output_record import OutputRecord, SeamsRecord
 from rdstitch.sidecar.paths import rebased_path, recorded_path
 from rdstitch.sidecar.recomposition import Recomposition
 from rdstitch.sidecar.records import VERSION, Applied
-from rdstitch.sidecar.write import versions
+from rdstitch.sidecar.write import camera_fields, versions
 from rdstitch.system.file_access import is_url
 from rdstitch.system.records import to_jsonable
 
@@ -39,12 +39,8 @@ def applied_sidecar(result: Recomposition, *, same_lens: bool) -> dict[str, Any]
     record = replace_fields(
         record,
         **({} if same_lens else _OF_ANOTHER_LENS),
+        **camera_fields(camera),
         version=VERSION,
-        lambda_=camera.lambda_,
-        lambda_px=camera.lambda_px,
-        lambda_focal=camera.lambda_focal,
-        camera=camera,
-        focal_px=camera.focal_px,
         reference=reference.name,
         output=OutputRecord.of(result),
         seams=SeamsRecord.of(result),

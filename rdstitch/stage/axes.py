@@ -1,7 +1,7 @@
 """Which way a stage's axes run in the image, and how far its steps go, by the strongest pairs of neighbours."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -13,7 +13,8 @@ from rdstitch.stage.evidence import HUNDRED_TO_ONE, MIN_AXES_EVIDENCE, wide_peak
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.pair_candidates import Candidates
 
-_TRIED, _ENOUGH = 48, 8  # pairs of an axis that are compared at most, and those with evidence that are enough
+_TRIED = 48  # pairs of an axis that are compared at most
+_ENOUGH = 8  # of these, pairs with evidence that are enough
 _MIN_RATIO = 1.2  # of evidence for other axes to that for the nominal ones: where one is right its pairs agree in both
 _ACROSS = 2.0  # times as far as along a step neighbours may be off across it
 _MAX_SKEW = 0.1  # radians that the two axes may be off it
@@ -47,10 +48,19 @@ class _Axis:
         return chosen
 
 
+@dataclass(frozen=True)
+class MeasuredAxis:
+    """What tiles show of an axis of a grid that is not as it was given."""
+
+    swapped: bool  # columns lie below each other, or rows beside each other
+    mirrored: bool  # the next one is on the other side
+    overlap: float  # of neighbours, fraction of a side
+
+
 def with_measured_axes(
     grid: TileGrid, read: Callable[[int], CoarseTile], factor: int, search: float
-) -> tuple[TileGrid, str]:
-    """The grid as its tiles show it, and in words what is not as given; unchanged, and "", unless clearly otherwise.
+) -> tuple[TileGrid, dict[int, MeasuredAxis]]:
+    """The grid as its tiles show it, and its axes, 0 for columns and 1 for rows, if they are clearly not as given.
 
     ``read`` gives tiles whose pixels are ``factor`` of the grid's; within ``search`` pixels it is as given.
     """
@@ -64,7 +74,7 @@ def with_measured_axes(
     if evidence(best) < max(MIN_AXES_EVIDENCE, _MIN_RATIO * evidence(nominal)) or all(
         np.abs(measured - step).max() <= search for measured, step in zip(best, nominal, strict=True)
     ):
-        return grid, ""
+        return grid, {}
     before, after = np.eye(2), np.eye(2)  # rows: from one column, or row, of the grid to the next, pixels
     for (k, axis), measured in zip(axes.items(), best, strict=True):
         before[k], after[k] = axis.step, measured
@@ -73,7 +83,7 @@ def with_measured_axes(
             after[k] = _across(before[k], before[1 - k], best[1 - k])
     places = grid.places @ np.linalg.solve(before, after)
     turned = replace(grid, places=places - places.min(axis=0))
-    return turned, _in_words({k: (before[k], after[k]) for k in axes}, grid.size)
+    return turned, {k: _measured(k, before[k], after[k], grid.size) for k in axes}
 
 
 def _axis(grid: TileGrid, axis: int, read: Callable[[int], CoarseTile], factor: int) -> _Axis | None:
@@ -114,14 +124,7 @@ def _across(nominal: FloatArray, other: FloatArray, other_measured: FloatArray) 
     return across if float(across @ nominal) >= 0.0 else -across
 
 
-def _in_words(steps: Mapping[int, tuple[FloatArray, FloatArray]], size: tuple[int, int]) -> str:
-    """What is not as it was given, by nominal and measured steps of each axis: directions, and overlaps."""
-    differences, overlaps = [], []
-    for k, (nominal, measured) in steps.items():
-        along = int(np.abs(measured).argmax())
-        if along != k:
-            differences.append(f"{('columns', 'rows')[k]} lie {'below' if along else 'beside'} each other")
-        if measured[along] * nominal[k] < 0.0:
-            differences.append(f"the next {('column', 'row')[k]} is {('left', 'above')[along]}")
-        overlaps.append(f"{100.0 * (1.0 - abs(measured[along]) / size[along]):.1f}")
-    return f"{', '.join([*differences, ''])}neighbours overlap by {' and '.join(overlaps)} %"
+def _measured(axis: int, nominal: FloatArray, measured: FloatArray, size: tuple[int, int]) -> MeasuredAxis:
+    along = int(np.abs(measured).argmax())
+    mirrored = bool(measured[along] * nominal[axis] < 0.0)
+    return MeasuredAxis(along != axis, mirrored, 1.0 - abs(float(measured[along])) / size[along])

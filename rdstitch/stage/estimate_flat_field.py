@@ -4,14 +4,14 @@ What a tile shows changes as often from light to dark across a cell's border as 
 there in every tile alike. So the medians, over all tiles, of the logarithmic steps between neighbouring cells are those
 of the illumination, which is a smooth surface over them.
 
-The dark level D, which light does not multiply, is where the variance of photon noise, which is in proportion to the
-light, becomes 0 (photon transfer). Few samples, and those that are no counts of light, as of JPEG files, show none: D
-is taken for 0, and the error of the flat field is what D may be instead.
+Where tiles do not show their dark level (:mod:`rdstitch.stage.dark_level`), it is taken for 0, and the error of the
+flat field is what it may be instead.
 """
 
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from enum import Enum, auto
 from typing import Any
 
 import numpy as np
@@ -21,47 +21,55 @@ from rdstitch.arrays import FloatArray
 from rdstitch.io.flat_field import FlatField
 from rdstitch.io.reduction import block_mean
 from rdstitch.robust.loss import NORMAL_MEDIAN, normal_std
+from rdstitch.stage.dark_level import DarkLevel, dark_level
 
-MIN_TILES = 20  # fewer show one flat field as well as another
+_MIN_TILES = 20  # fewer show one flat field as well as another
 LARGEST_ERROR = 0.01  # root mean square, by which two halves of the tiles may differ from their mean
-_PARTS = 4  # of the tiles, by which the error of the dark level is known
-_KNOWN = 3.0  # standard deviations from 0 from which on it is taken out
 _MAX_DARK = 1 / 16  # of the largest sample: cameras of 12 bits are set to a hundred counts
 _CELLS = 24  # cells along each side of a tile at most, or one a pixel where it has fewer
 _SIDE = 512  # pixels of the longer side that are enough
 _DEGREE = 4  # degree of the polynomial that the logarithm of the illumination is
 _TRUNCATED = 0.9113  # variance of a standard normal number within 2.5 of its mean
-# bins of brightness, and cells of a bin, by which noise is compared with light
-_BINS, _LEAST_BINS, _LEAST_IN_BIN = 24, 6, 16
+
+
+class FlatFieldUnknown(Enum):
+    """Why tiles do not show a flat field."""
+
+    FEW_TILES = auto()
+    UNSURE = auto()  # two halves of them do not show the same, or each has too few pixels
 
 
 @dataclass(frozen=True, eq=False)
 class Illumination:
-    """The flat field that tiles show, or why they do not."""
+    """The flat field that tiles show."""
 
-    field: FlatField | None  # None where two halves of the tiles do not show the same
+    field: FlatField
     error: float  # its root mean square error, by how far two halves of the tiles differ
-    shading: float  # largest share of the light that is missing
-    dark: FloatArray  # (C,)
-    dark_error: FloatArray  # (C,): its standard deviation; 0 where the tiles do not show it, and it is 0
+    shading: float  # largest fraction of the light that is missing
+    dark: tuple[DarkLevel | None, ...]  # of each channel; None where the tiles do not show it, and it is taken for 0
 
 
+@dataclass(frozen=True, eq=False)
 class _Statistics:
-    """Ground, and variance of noise and the light that it is of, of all cells of all tiles."""
+    """What the cells of T tiles hold; (T, cells down, cells across, C) each."""
 
-    def __init__(self, tiles: Iterable[NDArray[Any]]) -> None:
-        ground, light, variance, largest = [], [], [], 0.0
+    ground: FloatArray
+    light: FloatArray  # of which ``variance`` is the noise
+    variance: FloatArray
+    size: tuple[int, int]  # height and width of a tile that was made small, pixels
+    largest: float  # sample
+
+    @classmethod
+    def of(cls, tiles: Iterable[NDArray[Any]]) -> "_Statistics":
+        cells, size, largest = [], (0, 0), 0.0
         for tile in tiles:
             factor = max(1, round(max(tile.shape[:2]) / _SIDE))
-            small = block_mean(tile, factor).reshape(-(-tile.shape[0] // factor), -(-tile.shape[1] // factor), -1)
-            ground.append(np.median(_cells(small.astype(np.float32)), axis=-1))
-            mean, noise = _noise_of_ground(tile.reshape(*tile.shape[:2], -1))
-            light.append(mean)
-            variance.append(noise)
+            size = -(-tile.shape[0] // factor), -(-tile.shape[1] // factor)
+            ground = np.median(_cells(block_mean(tile, factor).reshape(*size, -1).astype(np.float32)), axis=-1)
+            cells.append((ground, *_noise_of_ground(tile.reshape(*tile.shape[:2], -1))))
             largest = max(largest, float(tile.max()))
-        self.size, self.largest = small.shape[:2], largest
-        self.used = tuple(math.prod(_cell_grid(side)) for side in self.size)
-        self.ground, self.light, self.variance = (np.array(v, dtype=np.float64) for v in (ground, light, variance))
+        ground, light, variance = (np.array(values, dtype=np.float64) for values in zip(*cells, strict=True))
+        return cls(ground, light, variance, size, largest)
 
 
 def _cells(plane: NDArray[Any]) -> NDArray[Any]:
@@ -102,26 +110,25 @@ class _Channel:
     """What tiles show of the light in one of their channels."""
 
     surface: FloatArray  # coefficients of the logarithm of the illumination
-    dark: float
-    dark_error: float  # 0 where the tiles do not show it, and it is 0
-    halves_error: float  # by which two halves of the tiles differ from their mean; root mean squares of shares
-    dark_effect: float  # by what the dark level may be instead
+    dark: DarkLevel | None
+    halves_error: float  # rms of fractions, by which two halves of the tiles differ from their mean
+    dark_effect: float  # rms of fractions, by what the dark level may be instead
     spread: float  # of the illumination itself
 
     @classmethod
     def of(cls, statistics: _Statistics, channel: int) -> "_Channel":
         ground = statistics.ground[..., channel]
-        dark, dark_error = _sure_dark_level(statistics.light[..., channel], statistics.variance[..., channel])
+        shown = dark_level(statistics.light[..., channel], statistics.variance[..., channel])
         # Where it is not shown, all are as likely up to the largest that cameras have: its root mean square.
         largest = min(_MAX_DARK * statistics.largest, float(np.quantile(ground, 0.01)))
-        other = dark + dark_error if dark_error else largest / math.sqrt(3.0)
+        dark, other = (0.0, largest / math.sqrt(3.0)) if shown is None else (shown.level, shown.level + shown.std)
         parts = ground - dark, ground[::2] - dark, ground[1::2] - dark, ground - other
         down, across = (_middles(cells) for cells in ground.shape[1:])
         surfaces = [_fitted(part) for part in parts]
         cells = [np.exp(_surface(surface, across, down)) for surface in surfaces]
         whole, half1, half2, darker = (light / light.mean() for light in cells)
         halves, effect = (float(np.sqrt((off**2).mean())) for off in ((half1 - half2) / 2.0, darker - whole))
-        return cls(surfaces[0], dark, dark_error, halves, effect, float(whole.std()))
+        return cls(surfaces[0], shown, halves, effect, float(whole.std()))
 
     @property
     def sure(self) -> bool:
@@ -130,38 +137,34 @@ class _Channel:
 
     @property
     def error(self) -> float:
-        """As of one of the halves: what both have in common, such as the form of the surface, is not seen."""
+        """That of one of the halves: what both have in common, such as the form of the surface, is not seen."""
         return math.hypot(math.sqrt(2.0) * self.halves_error, self.dark_effect)
 
 
-def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Illumination:
+def estimate_illumination(read: Callable[[int], NDArray[Any]], count: int) -> Illumination | FlatFieldUnknown:
     """Estimate the flat field and the dark level of tiles."""
+    if count < _MIN_TILES:
+        return FlatFieldUnknown.FEW_TILES
     first = read(0)
     # Second differences in every other row take two rows of three samples.
-    if count < MIN_TILES or first.shape[0] < 2 or first.shape[1] < 3:
-        return Illumination(None, math.inf, 0.0, np.zeros(1), np.zeros(1))
-    cells = _Statistics(read(index) for index in range(count))
+    if first.shape[0] < 2 or first.shape[1] < 3:
+        return FlatFieldUnknown.UNSURE
+    cells = _Statistics.of(read(index) for index in range(count))
     channels = [_Channel.of(cells, channel) for channel in range(cells.ground.shape[3])]
     # Centres of the pixels in the frame of the cells, from -1 to 1.
     x, y = (
-        2.0 * (np.arange(first.shape[axis]) + 0.5) * cells.size[axis] / first.shape[axis] / cells.used[axis] - 1.0
-        for axis in (1, 0)
+        2.0 * (np.arange(first.shape[axis]) + 0.5) * cells.size[axis] / first.shape[axis] / used - 1.0
+        for axis, used in ((k, math.prod(_cell_grid(cells.size[k]))) for k in (1, 0))
     )
     gain = np.stack([np.exp(_surface(channel.surface, x, y)) for channel in channels], axis=-1).astype(np.float32)
     gain /= gain.mean(axis=(0, 1))
-    dark, dark_error = (np.array(v) for v in zip(*((each.dark, each.dark_error) for each in channels), strict=True))
-    good = all(channel.sure for channel in channels) and bool(np.isfinite(gain).all())
-    field = FlatField(gain, dark.astype(np.float32)[None, None]) if good else None
+    if not all(channel.sure for channel in channels) or not np.isfinite(gain).all():
+        return FlatFieldUnknown.UNSURE
+    shown = tuple(channel.dark for channel in channels)
+    dark = np.array([0.0 if each is None else each.level for each in shown], dtype=np.float32)
     missing = float(1.0 - (gain.min(axis=(0, 1)) / gain.max(axis=(0, 1))).min())
-    return Illumination(field, max(channel.error for channel in channels), missing, dark, dark_error)
-
-
-def _sure_dark_level(light: FloatArray, variance: FloatArray) -> tuple[float, float]:
-    """D of a channel and its standard deviation, by parts of the tiles; 0 and 0 where they do not show it."""
-    dark = _dark_level(light, variance)
-    parts = [_dark_level(light[k::_PARTS], variance[k::_PARTS]) for k in range(_PARTS)]
-    error = float(np.std(parts, ddof=1)) / math.sqrt(_PARTS)
-    return (dark, error) if all(parts) and dark >= _KNOWN * error else (0.0, 0.0)
+    error = max(channel.error for channel in channels)
+    return Illumination(FlatField(gain, dark[None, None]), error, missing, shown)
 
 
 def agrees_with_overlaps(field: FlatField, overlaps: Iterable[tuple[NDArray[Any], NDArray[Any], FloatArray]]) -> bool:
@@ -207,7 +210,7 @@ def _surface(coefficients: FloatArray, x: FloatArray, y: FloatArray) -> FloatArr
 
 
 def _middles(cells: int) -> FloatArray:
-    """Of the cells along a side, from -1 to 1."""
+    """Middles of the cells along a side, from -1 to 1."""
     return np.asarray((2.0 * np.arange(cells) + 1.0) / cells - 1.0)
 
 
@@ -226,23 +229,3 @@ def _fitted(light: FloatArray) -> FloatArray:
         scale = max(normal_std(residual), 1e-12)
         weights = 1.0 / (1.0 + (residual / (3.0 * scale)) ** 2)
     return np.asarray(solution)
-
-
-def _dark_level(ground: FloatArray, variance: FloatArray) -> float:
-    """D of a channel by its photon noise, whose variance is in proportion to the light; 0 where that is not so."""
-    mean, noise = ground.ravel(), variance.ravel()
-    count = min(_BINS, len(mean) // _LEAST_IN_BIN)
-    if count < _LEAST_BINS:
-        return 0.0
-    bins = np.array_split(np.argsort(mean), count)
-    x = np.array([np.median(mean[part]) for part in bins])
-    # Of each bin the lower part: texture, too, is taken for noise.
-    y = np.array([np.quantile(noise[part], 0.25) for part in bins])
-    first, second = np.triu_indices(len(x), 1)
-    distinct = x[second] - x[first] > 0.0
-    slopes = (y[second] - y[first])[distinct] / (x[second] - x[first])[distinct]
-    low, slope = np.quantile(slopes, [0.16, 0.5]) if len(slopes) else (0.0, 0.0)
-    if not low > 0.0:
-        return 0.0
-    dark = float(np.median(x - y / slope))
-    return dark if 0.0 < dark < float(np.quantile(mean, 0.01)) else 0.0

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 from typing import Literal
 
 import numpy as np
@@ -27,18 +28,29 @@ _LENS_AGREES = 0.25  # of λ: by how much the two may differ beyond chance
 _WHOLE_PIXEL = 0.5  # pixels by which a lens must move corners: leaving whole pixels costs as much
 
 
+class LensEstimate(Enum):
+    """What is taken for a λ that is not known."""
+
+    FREE = auto()  # what all tiles together show
+    IF_SHOWN = auto()  # the same where pairs along rows and pairs along columns agree on it, else 0
+
+
 @dataclass(frozen=True, eq=False)
 class TileRegistration:
     """The places of all tiles, and the matches that show them."""
 
-    grid: TileGrid
+    plan: SearchPlan  # how neighbours were looked for
     adjustment: Adjustment
     links: LinkedPoints  # blocks of all pairs that show something
     compared: IntArray  # (Q, 2), int: all pairs that were compared
     groups: tuple[tuple[int, ...], ...]  # tiles that links hold together, the largest group first
-    search: float  # how far neighbours were looked for, pixels
     z: int | Literal["max"] | None = None  # z, time: plane and time of the files that were read, where they were chosen
     time: int | None = None
+
+    @property
+    def grid(self) -> TileGrid:
+        """The tiles, and where they should be."""
+        return self.plan.grid
 
     @property
     def linked(self) -> BoolArray:
@@ -66,17 +78,14 @@ def register_tiles(
     plan: SearchPlan,
     read: Reader,
     *,
-    distortion: float | Literal["auto"] | None = None,
+    distortion: float | LensEstimate = LensEstimate.IF_SHOWN,
     progress: Progress = silent,
 ) -> TileRegistration:
-    """Find the places of all tiles.
-
-    ``distortion``: λ, or "auto" to estimate it; else it is 0 unless pairs along rows and along columns agree on it.
-    """
-    if distortion == "auto" and plan.grid.tile_sizes is not None:
+    """Find the places of all tiles, with a λ that is known, or one that they show."""
+    if distortion is LensEstimate.FREE and plan.grid.tile_sizes is not None:
         raise ArgumentError("tiles of different sizes do not show λ; give it with --lambda, or leave that out")
     pairs = plan.grid.neighbours(plan.search)
-    known = distortion if isinstance(distortion, float | int) else None
+    known = None if isinstance(distortion, LensEstimate) else distortion
     finder = PairFinder(plan, pairs)
     candidates, lens = finder.candidates(read, known, progress)
     chosen = choose_places(pairs, candidates, plan, lens)
@@ -98,23 +107,23 @@ def register_tiles(
     held = links.tiles[fitted.weights > HOLDING_WEIGHT]
     groups = connected_components(len(plan.grid), *held.T)
     together = tuple(tuple(group) for group in groups if len(group) > 1)
-    return TileRegistration(plan.grid, fitted, links, pairs, together, plan.search)
+    return TileRegistration(plan, fitted, links, pairs, together)
 
 
-def _with_lens(
-    plan: SearchPlan, links: LinkedPoints, lens: float, wanted: float | Literal["auto"] | None
-) -> Adjustment:
-    """All places, with λ where it is asked for, or where it is there."""
+def _with_lens(plan: SearchPlan, links: LinkedPoints, lens: float, distortion: float | LensEstimate) -> Adjustment:
+    """All places, with λ where it is known, asked for, or shown; ``lens`` is where its estimate starts."""
     grid, std = plan.grid, plan.stage_std
-    if isinstance(wanted, float | int):
-        return replace(adjust(grid, links, std, float(wanted)), distortion_std=0.0)
+    if not isinstance(distortion, LensEstimate):
+        return replace(adjust(grid, links, std, float(distortion)), distortion_std=0.0)
     straight = adjust(grid, links, std)
     if not len(links.pair) or grid.tile_sizes is not None:
         return straight
     bent = adjust(grid, links, std, lens, free_lens=True)
     better = straight.cost(bent.noise) - bent.cost(bent.noise) > math.log(max(2, len(links.pair)))
     moved = abs(bent.distortion) * math.hypot(*grid.size) / 2.0
-    if wanted == "auto" or (better and moved > _WHOLE_PIXEL and _lens_is_there(grid, links, std, bent.distortion)):
+    if distortion is LensEstimate.FREE:
+        return bent
+    if better and moved > _WHOLE_PIXEL and _lens_is_there(grid, links, std, bent.distortion):
         return bent
     return replace(straight, distortion_std=max(bent.distortion_std, abs(bent.distortion)))
 

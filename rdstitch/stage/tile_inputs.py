@@ -93,7 +93,8 @@ def tile_frames(
     known = {frame.path: frame for frame in frames}
     tiles = list(frames)
     if not all(tile.is_plain for tile in stored.values()):
-        tiles = [frame for frame in frames if frame.path not in set(files)]
+        in_files = set(files)
+        tiles = [frame for frame in frames if frame.path not in in_files]
         tiles += [
             known[tile.name] if tile.is_plain else _frame(tile, "max" if z is None else z, time or 0)
             for tile in stored.values()

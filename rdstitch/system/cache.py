@@ -9,6 +9,7 @@ import hashlib
 import os
 import tempfile
 import time
+from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -35,28 +36,54 @@ _READERS = ("imagecodecs", "pillow", "pillow-heif", "rawpy", "simplejpeg", "tiff
 _PACKAGES = ("numpy", "scipy", *_OPENCV, *_READERS)
 
 
-@dataclass(frozen=True)
-class Stored(Generic[Value]):
-    """A result that is read when it is needed; one that could not be kept on disk stays in memory."""
+class Stored(ABC, Generic[Value]):
+    """A result that is read when it is needed."""
 
-    file: Path | None = None  # entry of a cache
-    value: Value | None = None  # the result itself, without a file
+    @property
+    @abstractmethod
+    def key(self) -> object:
+        """What stands for the result in the inputs of later ones."""
+
+    @abstractmethod
+    def load(self) -> Value:
+        """The result."""
+
+    def remove(self) -> None:
+        """Remove its file, if it has one; it can not be loaded any more then."""
+
+
+@dataclass(frozen=True)
+class InMemory(Stored[Value]):
+    """A result that is not, or could not be, kept on disk."""
+
+    value: Value
+
+    @property
+    def key(self) -> Value:
+        return self.value
+
+    def load(self) -> Value:
+        return self.value
+
+
+@dataclass(frozen=True)
+class OnDisk(Stored[Value]):
+    """An entry of a cache."""
+
+    file: Path
     folder: TemporaryFolder | None = field(default=None, compare=False, repr=False)  # what must not be removed before
 
     def load(self) -> Value:
         """The result; those used recently are still in memory."""
-        return cast(Value, self.value if self.file is None else _recent.recall(self.file))
+        return cast(Value, _recent.recall(self.file))
 
     @property
-    def name(self) -> str:
-        """What stands for the result in the inputs of later ones; empty without a file."""
-        return "" if self.file is None else _entry_name(self.file)
+    def key(self) -> str:
+        return _entry_name(self.file)
 
     def remove(self) -> None:
-        """Remove its file; it can not be loaded any more then."""
-        if self.file is not None:
-            with suppress(OSError):
-                self.file.unlink()
+        with suppress(OSError):
+            self.file.unlink()
 
 
 @dataclass(frozen=True)
@@ -103,12 +130,12 @@ class Cache:
     def stored(self, stage: str, inputs: tuple[Any, ...], compute: Callable[[], Value]) -> Stored[Value]:
         """As :meth:`recall`, but the result stays on disk until it is loaded."""
         if self.folder is None:
-            return Stored(value=compute())
+            return InMemory(compute())
         file = self._file(stage, inputs)
         if _kept(file):
-            return Stored(file, folder=self.temporary)
+            return OnDisk(file, self.temporary)
         value = compute()
-        return Stored(file, folder=self.temporary) if self._keep(file, value) else Stored(value=value)
+        return OnDisk(file, self.temporary) if self._keep(file, value) else InMemory(value)
 
     def recall_many(
         self, stage: str, inputs: Sequence[tuple[Any, ...]], compute: Callable[[list[int]], list[Value]]
@@ -132,7 +159,7 @@ class Cache:
         return self.folder / stage / name[:2] / name[2:]
 
     def _keep(self, file: Path, value: Any) -> bool:
-        """Write a result, and whether that was possible: a full or read-only cache is no reason to stop.
+        """Write a result, and say whether that was possible: a full or read-only cache is no reason to stop.
 
         What is of this run alone nobody reads before it is written.
         """
@@ -160,7 +187,7 @@ class Cache:
             return str(path)
         try:
             if is_url(path):
-                return remote_status(path)[2] or os.urandom(16).hex()
+                return remote_status(path).state or os.urandom(16).hex()
             with open_regular(path) as stream:
                 return hashlib.file_digest(stream, "sha256").hexdigest()
         except OSError:
@@ -192,8 +219,8 @@ def software() -> dict[str, str]:
 class _RecentlyUsed:
     """Values of files, of which the least recently used are dropped when there are too many."""
 
-    def __init__(self, room: int) -> None:
-        self._room = room
+    def __init__(self, capacity: int) -> None:
+        self._free_bytes = capacity
         self._held: OrderedDict[Path, tuple[Any, int]] = OrderedDict()
         self._lock = Lock()
 
@@ -205,9 +232,9 @@ class _RecentlyUsed:
         with self._lock:
             if file not in self._held:
                 self._held[file] = value, size
-                self._room -= size
-            while self._room < 0 and self._held:
-                self._room += self._held.popitem(last=False)[1][1]
+                self._free_bytes -= size
+            while self._free_bytes < 0 and self._held:
+                self._free_bytes += self._held.popitem(last=False)[1][1]
         return value
 
 

@@ -16,11 +16,11 @@ from functools import lru_cache, wraps
 from importlib import import_module
 from io import BufferedReader, BytesIO
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from rdstitch.errors import InputError
 
-MAX_FILE = 256 * 2**20  # bytes of a text; a sidecar of ten thousand images has about 30 MB
+MAX_TEXT = 256 * 2**20  # bytes of a text; a sidecar of ten thousand images has about 30 MB
 
 _BLOCK = 2**18  # bytes of a file that are fetched at a time where only its header is wanted
 _READ_AT_ONCE = 2**22  # bytes
@@ -105,19 +105,24 @@ def held_in_memory(path: Path) -> Iterator[None]:
         _held.reset(token)
 
 
-def remote_status(path: str | Path) -> tuple[bool, int | None, str]:
-    """Check whether it is a folder, its size in bytes where the server says that, and what changes with its content.
+class RemoteStatus(NamedTuple):
+    """What a server says of a URL."""
 
-    The last is empty where the server says nothing of that.
-    """
+    is_folder: bool
+    size: int | None  # bytes
+    state: str | None  # what changes with its content
+
+
+def remote_status(path: str | Path) -> RemoteStatus:
+    """Ask a server of a URL; what it does not say is None."""
     with _as_os_error():
         system, name = _filesystem(path)
         info = system.info(name)
         state = system.ukey(name)
         if "http" in getattr(system, "fs", system).protocol:  # whose key is that of the address
             known = [f"{key}: {info[key]}" for key in _HTTP_STATES if info.get(key)]
-            state = "\n".join([*known, f"{info.get('size')} bytes"]) if known else ""
-        return info["type"] == "directory", info.get("size"), state
+            state = "\n".join([*known, f"{info.get('size')} bytes"]) if known else None
+        return RemoteStatus(info["type"] == "directory", info.get("size"), state or None)
 
 
 def remote_names(url: str) -> list[str]:
@@ -171,8 +176,8 @@ def content_state(path: str | Path) -> ContentState | None:
     if not is_url(path):
         return file_state(path)
     with suppress(OSError):
-        _, size, state = remote_status(path)
-        return state or f"{size} bytes"
+        status = remote_status(path)
+        return status.state or f"{status.size} bytes"
     return None
 
 
@@ -213,9 +218,9 @@ def read_limited(path: str | Path, most: int, *, regular: bool = True) -> bytes:
 
 
 def read_beginning(path: str | Path, most: int, *, regular: bool = True) -> bytes:
-    """As much of a file, but no more, however large it is."""
+    """The first ``most`` bytes of a file or URL, or all where it has fewer; unless ``regular``, also of a pipe."""
     blocks = []
-    with open_regular(path) if regular else Path(path).open("rb") as stream:
+    with open_regular(path) if regular or is_url(path) else Path(path).open("rb") as stream:
         # What a stream is asked for is allocated, however small the file.
         while most > 0 and (block := stream.read(min(most, _READ_AT_ONCE))):
             most -= len(block)
@@ -227,6 +232,6 @@ def read_text(path: str | Path, *, regular: bool = True) -> str:
     """The text of a file of a reasonable size; pipes and devices, which may never end, only if not ``regular``."""
     try:
         # Names of files that are not UTF-8 are written as they are, and come back as they were.
-        return read_limited(path, MAX_FILE, regular=regular).decode("utf-8-sig", "surrogateescape")
+        return read_limited(path, MAX_TEXT, regular=regular).decode("utf-8-sig", "surrogateescape")
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error

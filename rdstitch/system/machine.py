@@ -33,7 +33,7 @@ def memory_size() -> int:
 
 
 def _memory(root: Path, what: str) -> int:
-    """Of the whole system."""
+    """Memory of the whole system by what ``/proc/meminfo`` calls it, bytes."""
     for line in _text(root / "proc/meminfo").splitlines():
         if line.startswith(what):
             return int(line.split()[1]) * 1024

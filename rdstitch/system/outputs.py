@@ -6,19 +6,17 @@ sidecar is staged last and names size and digest of its image: where a run is cu
 reader sees that the older sidecar is of another image.
 """
 
-import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from rdstitch.errors import OutputError, RdstitchError
 from rdstitch.results.messages import Message
-from rdstitch.system.output_checks import check_folder, holds_only_tiles, is_zarr, naming
+from rdstitch.system.output_checks import naming
 from rdstitch.system.temporary_folder import TemporaryFolder
 
 
@@ -34,7 +32,7 @@ def write_bytes_atomic(path: str | Path, data: bytes, overwrite: bool = True) ->
 
 
 def text_bytes(text: str) -> bytes:
-    """Text in UTF-8; names of files that are none come out as they are."""
+    """Encode text as UTF-8; names of files that are none come out as they are."""
     return text.encode("utf-8", "surrogateescape")
 
 
@@ -48,43 +46,13 @@ def json_bytes(data: Any) -> bytes:
     return text.encode("utf-8", "backslashreplace")
 
 
-@dataclass(frozen=True)
-class Fingerprint:
-    """What an image's files come to."""
-
-    size: int  # bytes of all files
-    # of the file; of a Deep Zoom image that of the list of its files, as ``sha256sum`` prints it (digest, two spaces,
-    # name), in order of names, the description first as ``.dzi``; of an OME-Zarr image the same of all its files
-    sha256: str
-
-
-def fingerprint(image: Path, tiles: Path | None = None) -> Fingerprint:
-    """The fingerprint of an image, and of the tiles that belong to it."""
-    if image.is_dir():
-        tiles, named = image, []
-    elif tiles is None:
-        return Fingerprint(image.stat().st_size, _sha256(image))
-    else:
-        named = [(".dzi", image)]
-    members = sorted(path for path in tiles.rglob("*") if path.is_file())
-    files = [*named, *((file.relative_to(tiles).as_posix(), file) for file in members)]
-    listing = "".join(f"{_sha256(file)}  {name}\n" for name, file in files)
-    return Fingerprint(sum(file.stat().st_size for _, file in files), hashlib.sha256(listing.encode()).hexdigest())
-
-
-def _sha256(file: Path) -> str:
-    with file.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
 class _Item(NamedTuple):
     """One output: its name as given, its place, and where it is staged."""
 
     name: Path
     place: Path
     staged: Path
-    is_folder: bool
-    check: Callable[[Path], None] | None  # refuses to replace a folder that is something else
+    check: Callable[[Path], None] | None  # of a folder: refuses to replace one that is something else
 
 
 class Outputs:
@@ -98,7 +66,7 @@ class Outputs:
         self._folders: dict[Path, TemporaryFolder] = {}
         self._made: list[Path] = []  # folders for outputs, the inner ones first
         self._items: list[_Item] = []
-        self._number = 0  # of what is staged next, also after something was dropped
+        self._number = 0  # of what is staged next
 
     @classmethod
     def or_own(cls, outputs: "Outputs | None", overwrite: bool = True) -> AbstractContextManager["Outputs"]:
@@ -132,24 +100,33 @@ class Outputs:
             raise OutputError(f"{folder}: cannot make the folder: {error.strerror}") from error
 
     @contextmanager
-    def writing(
-        self, path: str | Path, *, is_folder: bool = False, check: Callable[[Path], None] | None = None
-    ) -> Iterator[Path]:
-        """Stage a file, or a folder; a failure of the file system is one of ``path``.
-
-        Yields where to write the file, or the empty folder. ``check`` refuses to replace a folder that is there, which
-        must otherwise hold Deep Zoom tiles or chunks.
-        """
+    def writing(self, path: str | Path) -> Iterator[Path]:
+        """Stage a file; a failure of the file system is one of ``path``. Yields where to write it."""
         name = Path(path)
         with naming(name), self.together():
-            staged = self._stage(name, is_folder, check)
-            if is_folder:
-                staged.mkdir()
+            staged = self._stage(name, self._new_name(name.suffix))
             yield staged
-            if not is_folder:
-                # A full disk must be noticed before anything is replaced.
-                with staged.open("rb+") as stream:
-                    os.fsync(stream.fileno())
+            _flush(staged)
+
+    @contextmanager
+    def writing_folder(self, path: str | Path, check: Callable[[Path], None]) -> Iterator[Path]:
+        """Stage a folder; ``check`` refuses to replace one that is there. Yields the empty folder to write into."""
+        name = Path(path)
+        with naming(name), self.together():
+            staged = self._stage(name, self._new_name(name.suffix), check)
+            staged.mkdir()
+            yield staged
+
+    @contextmanager
+    def writing_pair(self, folder: Path, file: Path, check: Callable[[Path], None]) -> Iterator[tuple[Path, Path]]:
+        """Stage a folder and the file that is found beside it: by the same name, but for their endings."""
+        with naming(file), self.together():
+            number = self._new_name("")
+            inner = self._stage(folder, number + folder.name.removeprefix(_place_of(file).stem), check)
+            inner.mkdir()
+            staged = self._stage(file, number + file.suffix)
+            yield inner, staged
+            _flush(staged)
 
     def write(self, path: str | Path, data: bytes) -> None:
         """Stage a file with this content."""
@@ -175,26 +152,24 @@ class Outputs:
             yield
         except BaseException:
             del self._items[count:]
-            self._number += 1
             raise
 
     def where(self, path: str | Path) -> Path:
         """Where a file lies now: staged, until it is in its place."""
         return next((item.staged for item in self._items if item.name == Path(path)), Path(path))
 
-    def _stage(self, name: Path, is_folder: bool, check: Callable[[Path], None] | None) -> Path:
-        place = Path(os.path.realpath(name.parent)) / name.name
-        if place.is_symlink():
-            place = Path(os.path.realpath(place))
+    def _new_name(self, ending: str) -> str:
+        self._number += 1
+        return f"new{self._number}{ending}"
+
+    def _stage(self, name: Path, staged_name: str, check: Callable[[Path], None] | None = None) -> Path:
+        place = _place_of(name)
         if any(item.place == place for item in self._items):
             raise OutputError(f"{name}: is the name of two outputs; choose another one for each")
         if place.parent not in self._folders:
             self._folders[place.parent] = TemporaryFolder(place.parent, ".rdstitch-")
-        is_tiles = is_folder and check is None and not is_zarr(name)
-        # Tiles are staged just before their description, and are found beside it by its name.
-        staged = self._folders[place.parent].path / f"new{self._number}{'_files' if is_tiles else name.suffix}"
-        self._number += not is_tiles
-        self._items.append(_Item(name, place, staged, is_folder, check))
+        staged = self._folders[place.parent].path / staged_name
+        self._items.append(_Item(name, place, staged, check))
         return staged
 
     def _check(self, item: _Item) -> None:
@@ -203,17 +178,13 @@ class Outputs:
             return
         if not self.overwrite:
             raise _appeared(item.name)
-        if not item.is_folder:
+        if item.check is None:
             item.staged.chmod(item.place.stat().st_mode & 0o777)
-        elif item.check is not None:
+        else:
             item.check(item.place)
-        elif is_zarr(item.place):
-            check_folder(item.place, overwrite=True)
-        elif not holds_only_tiles(item.place):
-            raise OutputError(f"{item.name}: holds other files than Deep Zoom tiles; choose another name")
 
     def _place(self, item: _Item) -> None:
-        if item.is_folder:
+        if item.check is not None:
             self._place_folder(item)
         elif self.overwrite:
             item.staged.replace(item.place)
@@ -235,6 +206,18 @@ class Outputs:
             if item.place.exists():
                 raise _appeared(item.name) from None
             raise
+
+
+def _place_of(name: Path) -> Path:
+    """Where an output goes: what a link leads to is replaced, the link stays."""
+    place = Path(os.path.realpath(name.parent)) / name.name
+    return Path(os.path.realpath(place)) if place.is_symlink() else place
+
+
+def _flush(file: Path) -> None:
+    """Have a file on disk: that one is full must be noticed before anything is replaced."""
+    with file.open("rb+") as stream:
+        os.fsync(stream.fileno())
 
 
 def replace_folder(new: Path, place: Path) -> None:

@@ -29,7 +29,10 @@ Matrix = Annotated[tuple[Triple, Triple, Triple], Meta(description="3 x 3, row b
 
 
 def parse_json(text: str, file: str) -> Any:
-    """JSON text as plain values; ``file`` is what messages call it."""
+    """JSON text as plain values; ``file`` is what messages call it.
+
+    Numbers that are not finite, NUL characters and deep nesting are refused, wherever they are.
+    """
     try:
         value = json.loads(text)
     except json.JSONDecodeError as error:
@@ -86,7 +89,9 @@ def convert(value: Any, kind: Callable[..., Kind], file: str, field: str = "", *
         if missing := re.fullmatch(r"Object missing required field `(.*)`", problem):
             path, problem = f"{path.rstrip('`')}.{missing[1]}", "is missing"
         place = (field + path.rstrip("`")).lstrip(".")
-        raise InputError(": ".join(filter(None, (file, place, problem[:1].lower() + problem[1:])))) from error
+        if not problem[1:2].isupper():  # as of EPSG
+            problem = problem[:1].lower() + problem[1:]
+        raise InputError(": ".join(filter(None, (file, place, problem)))) from error
     except (UnicodeError, OverflowError) as error:
         raise InputError(f"{file}: cannot be read: {error}") from error
 

@@ -28,13 +28,15 @@ class ResultEvidence:
 
     @property
     def alignment(self) -> Alignment:
-        """Of the registration."""
+        """The alignment of the registration."""
         return self.registration.alignment
 
     @property
     def static(self) -> bool:
-        """Whether the images mostly show what is static in them: some matches of that remain, which agree with nothing,
-        and it looks alike anywhere but where the moving plane puts it.
+        """Whether the images mostly show what is static in them.
+
+        Some matches of that remain, which agree with nothing, and it looks alike anywhere but where the moving plane
+        puts it.
         """
         return self.registration.static_background
 
@@ -62,31 +64,36 @@ class ResultEvidence:
     @cached_property
     def ambiguous(self) -> dict[Pair, CheckedLink]:
         """Pairs of a repeated pattern, of which nobody can say by how many periods they are apart."""
-        return {link.pair: link for link in self.checked if link.ambiguity.ambiguous and not link.unique}
+        return {link.pair: link for link in self.checked if link.ambiguous}
 
-    def explained_by_depth(self, images: Sequence[int]) -> bool:
-        """Whether matches of an image, of a pair, or of all if empty, disagree where a picture is more alike than by
-        chance: it has depth, or something moved.
+    def explained_by_depth(self, images: Sequence[int] | None) -> bool:
+        """Whether matches disagree where a picture is more alike than by chance: it has depth, or something moved.
+
+        ``images``: the image or pair whose overlaps are looked at; None for all overlaps.
         """
         if not self.purpose.picture:
             return False
-        overlaps = [link.agreement for link in self.checked if len({*images} & {*link.pair}) == len(images)]
+        overlaps = [link.agreement for link in self.checked if images is None or {*images} <= {*link.pair}]
         cells, confirming = sum(each.cells for each in overlaps), sum(each.confirming for each in overlaps)
         if cells < Limits.min_cells or confirming < Limits.max_unlike_fraction * cells:
             return False
         return binomial_tail(confirming, cells, Limits.alike_by_chance) < Limits.max_chance
 
     @cached_property
-    def alike_fraction(self) -> float:
-        """How much alike images look where most pairs put them, [0, 1]; 0 where there is nothing to see."""
-        shares = [
-            link.agreement.confirming_fraction for link in self.checked if link.agreement.cells >= Limits.min_cells
-        ]
-        return float(np.median(shares)) if shares else 0.0
+    def alike_fraction(self) -> float | None:
+        """How much alike images look where most pairs put them, [0, 1]; None where there is nothing to see."""
+        fractions = [link.agreement.confirming_fraction for link in self.checked]
+        known = [fraction for fraction in fractions if fraction is not None]
+        return float(np.median(known)) if known else None
+
+    def is_alike(self, fraction: float) -> bool:
+        """Whether images are seen to look alike by a fraction or more."""
+        return self.alike_fraction is not None and self.alike_fraction >= fraction
 
     @property
-    def flat(self) -> bool:
-        """Whether the images are said to show a plane that three or more of them hold together: of a turn, and of two
-        images, only overlaps can be wrong, and they are looked at.
+    def held_by_three(self) -> bool:
+        """Whether three or more images are said to show one plane and hold it together.
+
+        Where the camera turned, and of two images, only overlaps can be wrong, and they are looked at.
         """
         return not self.alignment.on_sphere and int(self.alignment.used.sum()) > 2

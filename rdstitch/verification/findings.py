@@ -1,10 +1,13 @@
 """What the rules find: data that repairs are made from, and the one place where they become sentences."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from enum import Enum
-from typing import Any
+from enum import Enum, auto
+from string import Formatter
+from typing import NamedTuple
 
+from rdstitch.alignment.result import ReliefTest
+from rdstitch.alignment.sentences import few_features
 from rdstitch.results.messages import MAX_NAMED, Message, Severity, names_of, shortened
 from rdstitch.results.registration import Registration
 
@@ -17,8 +20,34 @@ class Scope(Enum):
     PAIR = 2
 
 
+class Misfit(Enum):
+    """Why matches agree with each other only."""
+
+    FEW_FEATURES = auto()
+    FEW_MATCHES = auto()
+    OTHER_MOTION = auto()
+
+
+class Images(tuple[int, ...]):
+    """Indices of images, which a sentence names."""
+
+
+class Pairs(tuple[tuple[int, ...], ...]):
+    """Pairs of images, which a sentence names."""
+
+
+class Bodies(dict[str, Images]):
+    """Images by make, model and serial number of the camera."""
+
+
+Value = int | float | Misfit | ReliefTest | Images | Pairs | Bodies
+
+
 class Kind(Enum):
-    """What there is to find: what is to blame, a heading in docs/troubleshooting.md, and the sentence."""
+    """What there is to find: what is to blame, a heading in docs/troubleshooting.md, and the sentence.
+
+    ``measured``: names of the values that a finding of this kind has; ``first``, ``second``, ``both`` are its images.
+    """
 
     # fmt: off
     LENSES_MIXED = Scope.WHOLE, "", (
@@ -29,18 +58,20 @@ class Kind(Enum):
         "only {inliers} of {count} matches fit the places that were found for the images"
     )
     IMAGE_MISFITS = Scope.IMAGE, "", (
-        "only {inliers} of {count} of its matches fit the place that was found for it; {reason}"
+        "only {inliers} of {count} of its matches fit the place that was found for it; {misfit}"
     )
     PAIR_MISFITS = Scope.PAIR, "", (
-        "{both}: only {inliers} of {count} matches fit the places that were found for them; {reason}"
+        "{both}: only {inliers} of {count} matches fit the places that were found for them; {misfit}"
     )
     ERRORS = Scope.WHOLE, "", "the images disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels"
     ROUGH = Scope.WHOLE, "relief", (
         "the images disagree by {rms:.1f} pixels, more than the threshold of {threshold:g} pixels, most of all "
         "{both}: the ground is rough"
     )
-    RELIEF = Scope.WHOLE, "relief", "{what}; most of all between {first} and {second} ({rms:.1f} pixels)"
-    DEPTH_OF_A_TURN = Scope.WHOLE, "parallax", "{what}; most of all between {first} and {second} ({rms:.1f} pixels)"
+    RELIEF = Scope.WHOLE, "relief", "{relief.explanation}; most of all between {first} and {second} ({rms:.1f} pixels)"
+    DEPTH_OF_A_TURN = Scope.WHOLE, "parallax", (
+        "{relief.explanation}; most of all between {first} and {second} ({rms:.1f} pixels)"
+    )
     FREE_HOMOGRAPHIES = Scope.WHOLE, "shape", (
         "global accuracy unknown: the images do not come from one camera with one focal length, or what they show is "
         "not flat; each has a homography of its own, and their errors add up from image to image, most of all between "
@@ -55,16 +86,16 @@ class Kind(Enum):
     )
     PATTERN = Scope.WHOLE, "", "{count} of {of} pairs fit as well elsewhere (a repeated pattern?)"
     OVERLAPS_SAMPLED = Scope.WHOLE, "", (
-        "of {of} overlaps {count} were compared in their pixels, {sampled} of them at random: at most {share:.1%} of "
-        "all are wrong, with a confidence of 95%"
+        "of {of} overlaps {count} were compared in their pixels, {sampled} of them at random: at most {fraction:.1%} "
+        "of all are wrong, with a confidence of 95%"
     )
     SETTLED_PATTERN = Scope.WHOLE, "repeated-pattern", (
         "the images show a repeated pattern; what is unique in them (dirt, a mark, an object) decided where they lie; "
         "look at the seams, that between {first} and {second} first"
     )
     RIVAL_MOTION = Scope.WHOLE, "rival-motion", (
-        "what was put together fills at most {share:.0%} of the images, and the rest looks different (something that "
-        "moved, or a second surface?); mask what does not belong to the plane"
+        "what was put together fills at most {fraction:.0%} of the images, and the rest looks different (something "
+        "that moved, or a second surface?); mask what does not belong to the plane"
     )
     TWO_OF_ONE_LENS = Scope.WHOLE, "mixed-lenses", (
         "{both} fit without the images of another lens, as any two do; if all are of one lens, the scene is not flat, "
@@ -77,18 +108,20 @@ class Kind(Enum):
         "the lens was zoomed between the images, by up to {ratio:.2f} (between {near} and {far}); stitch those of one "
         "zoom on their own"
     )
-    UNMASKED = Scope.WHOLE, "", "{without_count} of {of_all} images have no mask: {without}"
+    UNMASKED = Scope.WHOLE, "", "{count} of {of} images have no mask: {without}"
     OUTVOTED = Scope.WHOLE, "doubtful-seam", (
-        "{they_fit} badly, and little depends on {them}: {named}; look at the seams between them"
+        "{pairs.fit} badly, and little depends on {pairs.them}: {pairs.names}; look at the seams between them"
     )
     OUTVOTED_PATTERN = Scope.WHOLE, "doubtful-seam", (
-        "{they_fit} as well elsewhere (a repeated pattern?), and little depends on {them}: {named}; look at the seams "
-        "between them"
+        "{pairs.fit} as well elsewhere (a repeated pattern?), and little depends on {pairs.them}: {pairs.names}; look "
+        "at the seams between them"
     )
     # fmt: on
 
     def __init__(self, scope: Scope, code: str, text: str) -> None:
         self.scope, self.code, self.text = scope, code, text
+        words = {name.partition(".")[0] for _, name, _, _ in Formatter().parse(text) if name}
+        self.measured = words - {"first", "second", "both"}
 
 
 @dataclass(frozen=True)
@@ -96,10 +129,12 @@ class Finding:
     """One thing that a rule found."""
 
     kind: Kind
+    severity: Severity  # as of :class:`rdstitch.results.messages.Message`
     images: tuple[int, ...] = ()  # indices of the images that it concerns; empty where it concerns the whole
-    severity: Severity = "failure"  # as of :class:`rdstitch.results.messages.Message`
-    # what the rule measured, of which the kind's sentence names some: images by their indices
-    values: Mapping[str, Any] = field(default_factory=dict)
+    values: Mapping[str, Value] = field(default_factory=dict)  # what the rule measured, as the kind's sentence names it
+
+    def __post_init__(self) -> None:
+        assert self.values.keys() == self.kind.measured, f"{self.kind}: {self.values.keys()}, not {self.kind.measured}"
 
     @property
     def fails(self) -> bool:
@@ -109,29 +144,52 @@ class Finding:
 
 def messages_of(findings: Iterable[Finding], registration: Registration) -> list[Message]:
     """One message for each finding."""
-    paths = [str(source.path) for source in registration.sources]
-    return [_message(finding, paths) for finding in findings]
+    return [_message(finding, registration) for finding in findings]
 
 
-def _message(finding: Finding, paths: Sequence[str]) -> Message:
-    images, values = tuple(paths[k] for k in finding.images), dict(finding.values)
-    names = names_of(images)
-    if "pairs" in values:
-        pairs = values.pop("pairs")
-        values["named"] = shortened([" and ".join(names_of([paths[i], paths[j]])) for i, j in pairs])
-        several = len(pairs) > 1
-        values |= {"they_fit": f"{len(pairs)} pairs fit" if several else "one pair fits"}
-        values |= {"them": "them" if several else "it"}
+def _message(finding: Finding, given: Registration) -> Message:
+    kind, names = finding.kind, _names(given, finding.images)
+    words = {name: _in_words(value, finding, given) for name, value in finding.values.items()}
     if len(names) == 2:
-        values |= {"first": names[0], "second": names[1], "both": " and ".join(names)}
-    for key in ("images1", "images2", "without"):
-        if key in values:
-            values[f"{key}_count"] = len(values[key])
-            values[key] = shortened(names_of(paths[k] for k in values[key]))
-    values |= {key: names_of([paths[values[key]]])[0] for key in ("near", "far") if key in values}
-    if "bodies" in values:
-        bodies = sorted(values["bodies"].items(), key=lambda body: -len(body[1]))
-        listed = (f"{body} ({len(shown)}: {shortened(names_of(paths[k] for k in shown))})" for body, shown in bodies)
-        values |= {"number": len(bodies), "bodies": "; ".join([*listed][:MAX_NAMED])}
-    kind = finding.kind
-    return Message(kind.text.format(of_all=len(paths), **values), images, finding.severity, kind.code, kind.name)
+        words |= {"first": names[0], "second": names[1], "both": " and ".join(names)}
+    images = tuple(str(given.sources[k].path) for k in finding.images)
+    return Message(kind.text.format(**words), images, finding.severity, kind.code, kind.name)
+
+
+class _PairWords(NamedTuple):
+    fit: str
+    them: str
+    names: str
+
+
+def _in_words(value: Value, finding: Finding, given: Registration) -> object:
+    """A value as a sentence has it: what is neither images nor a reason is formatted by the sentence itself."""
+    match value:
+        case Misfit():
+            return _misfit_in_words(value, finding, given)
+        case Images():
+            return shortened(_names(given, value))
+        case Pairs():
+            fit, them = (f"{len(value)} pairs fit", "them") if len(value) > 1 else ("one pair fits", "it")
+            return _PairWords(fit, them, shortened([" and ".join(_names(given, pair)) for pair in value]))
+        case Bodies():
+            commonest = sorted(value.items(), key=lambda body: -len(body[1]))[:MAX_NAMED]
+            return "; ".join(f"{body} ({len(shown)}: {shortened(_names(given, shown))})" for body, shown in commonest)
+        case _:
+            return value
+
+
+def _misfit_in_words(misfit: Misfit, finding: Finding, given: Registration) -> str:
+    remedy = " stitch them on their own" if finding.kind is Kind.PAIR_MISFITS else ""
+    match misfit:
+        case Misfit.FEW_FEATURES:
+            few = ((given.sources[k].name, few_features(given.keypoints, k)) for k in finding.images)
+            return ", ".join(f"{name} has {why}" for name, why in few if why)
+        case Misfit.FEW_MATCHES:
+            return f"too few to place it: little overlap, or none?{remedy}"
+        case Misfit.OTHER_MOTION:
+            return f"they fit each other: does it show another surface, or come from another camera or zoom?{remedy}"
+
+
+def _names(given: Registration, images: Iterable[int]) -> list[str]:
+    return names_of(str(given.sources[k].path) for k in images)

@@ -28,9 +28,10 @@ from rdstitch.verification.self_similarity import SLACK, Ambiguity, drawing_scal
 from rdstitch.verification.unique_places import IMAGES_AT_ONCE, unique_shifts
 
 _MAX_LINKS = 40  # up to which all are looked at; of more, so many of the least confirmed, and some of all at random
-# Links that are taken at random, and their share of all at the most. If none of 300 is wrong, with a confidence of 95 %
-# less than one in a hundred is, however many there are.
-_MOST_SAMPLED, _SAMPLED = 300, 0.05
+# Links that are taken at random, at most: if none of 300 is wrong, with a confidence of 95 % less than one in a hundred
+# is, however many there are.
+_MOST_SAMPLED = 300
+_SAMPLED_FRACTION = 0.05  # of all links, that are taken at random
 _CONFIDENCE = 1.645  # standard deviations that a normal variable exceeds with a probability of 5 %
 _CACHED_IMAGES = 128  # that are kept while pairs are compared, 1 MB each
 
@@ -42,8 +43,14 @@ class CheckedLink:
     fit: LinkFit
     agreement: Agreement  # whether the two look alike where they are put together
     ambiguity: Ambiguity  # whether they would look as much alike elsewhere
-    unique: bool = False  # whether they would, but for something unique that both show, which shows that they lie here
+    # whether they would, but for something unique that both show, which shows that they lie here
+    decided_by_unique_content: bool = False
     sampled: bool = False  # whether it was taken at random from more
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether nothing decides between this place and another."""
+        return self.ambiguity.ambiguous and not self.decided_by_unique_content
 
     @property
     def pair(self) -> tuple[int, int]:
@@ -114,12 +121,12 @@ def check_overlaps(registration: Registration, images: ComparedImages, cache: Ca
 
 
 def wrong_at_most(checked: Sequence[CheckedLink]) -> float:
-    """Share of all links that may look unlike, by those taken at random (Wilson's upper bound, 95 %); 1 without any."""
-    cells, unlike = Limits.min_cells, Limits.max_unlike_fraction
-    sampled = [link.agreement for link in checked if link.sampled and link.agreement.cells >= cells]
-    if not sampled:
+    """Fraction of all links that may look unlike, by those taken at random (Wilson's upper bound, 95 %); 1 without."""
+    sampled = [link.agreement.confirming_fraction for link in checked if link.sampled]
+    known = [fraction for fraction in sampled if fraction is not None]
+    if not known:
         return 1.0
-    count, wrong, z = len(sampled), sum(each.confirming_fraction < unlike for each in sampled), _CONFIDENCE
+    count, wrong, z = len(known), sum(fraction < Limits.max_unlike_fraction for fraction in known), _CONFIDENCE
     middle = wrong + z**2 / 2.0
     return float((middle + z * np.sqrt(wrong * (count - wrong) / count + z**2 / 4.0)) / (count + z**2))
 
@@ -127,19 +134,19 @@ def wrong_at_most(checked: Sequence[CheckedLink]) -> float:
 def _resolve_by_departures(
     images: ComparedImages, alignment: Alignment, checked: Sequence[CheckedLink]
 ) -> list[CheckedLink]:
-    """The same links; those that are ambiguous but for something unique are known to be."""
-    known: set[tuple[int, int]] = set()
+    """The same links; of those that are ambiguous, what is unique in both images decides some."""
+    decided: set[tuple[int, int]] = set()
     for pairs in _few_images([link.pair for link in checked if link.ambiguity.ambiguous]):
         placed = images.aligned(alignment, chain.from_iterable(pairs))
         for (first, second), unique in unique_shifts(placed, pairs, images.threads).items():
             image = placed[second]
             if np.hypot(*unique.shift) * drawing_scale(image.camera, image.homography) <= SLACK:
-                known.add((first, second))
-    return [replace(link, unique=link.pair in known) for link in checked]
+                decided.add((first, second))
+    return [replace(link, decided_by_unique_content=link.pair in decided) for link in checked]
 
 
 def _few_images(pairs: Iterable[tuple[int, int]]) -> Iterator[list[tuple[int, int]]]:
-    """The pairs in groups of no more images than may be compared by what is unique at once."""
+    """Pairs in groups, each of no more images than may be compared by what is unique at once."""
     group: list[tuple[int, int]] = []
     for pair in pairs:
         if len({*pair, *chain.from_iterable(group)}) > IMAGES_AT_ONCE:
@@ -150,22 +157,22 @@ def _few_images(pairs: Iterable[tuple[int, int]]) -> Iterator[list[tuple[int, in
 
 
 def _between(first: ComparedImage, second: ComparedImage) -> tuple[ComparedImage, ComparedImage]:
-    """No plane shows all images of a turn; one between the two shows both, and stretches what both show the least."""
+    """Two images of a turn on a plane between them, as no plane shows all: it stretches what both show the least."""
     both = np.stack([first.homography, second.homography])
     to_plane = nearest_rotation((both / np.linalg.norm(both, axis=1)[:, None]).sum(axis=0)).T @ both
     return replace(first, homography=to_plane[0]), replace(second, homography=to_plane[1])
 
 
 def _at_random(links: Sequence[LinkFit]) -> set[tuple[int, int]]:
-    """Images of links that are taken at random, where there are too many for all to be looked at."""
+    """Pairs of links that are taken at random, where there are too many for all to be looked at."""
     if len(links) <= _MAX_LINKS:
         return set()
-    count = min(_MOST_SAMPLED, int(_SAMPLED * len(links)))
+    count = min(_MOST_SAMPLED, int(_SAMPLED_FRACTION * len(links)))
     return {links[k].images for k in np.random.default_rng(0).choice(len(links), count, replace=False)}
 
 
 def _least_confirmed(links: Sequence[LinkFit]) -> set[tuple[int, int]]:
-    """Images of the links in the fewest triangles, then of those with the fewest inliers."""
+    """Pairs of the links in the fewest triangles, then of those with the fewest inliers."""
     neighbours: dict[int, set[int]] = {}
     for fit in links:
         neighbours.setdefault(fit.image1, set()).add(fit.image2)

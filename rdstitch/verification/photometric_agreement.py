@@ -47,13 +47,13 @@ class Agreement:
     cells: int  # cells with texture in both images
     confirming: int  # cells that correlate best, and well, where the registration says
     textured_cells: int = 0  # cells with texture in the whole of the second image
-    # share of the overlap that looks alike three times smaller; NaN where it is too small
+    # fraction of the overlap that looks alike three times smaller; NaN where it is too small
     coarse_similarity: float = math.nan
 
     @property
-    def confirming_fraction(self) -> float:
-        """Share of the cells that confirm the registration; 1 without cells."""
-        return self.confirming / self.cells if self.cells else 1.0
+    def confirming_fraction(self) -> float | None:
+        """Fraction of the cells that confirm the registration; None where they are too few to say anything."""
+        return self.confirming / self.cells if self.cells >= Limits.min_cells else None
 
     @property
     def unlike_cells(self) -> float:
@@ -125,7 +125,10 @@ def _plain_frame(grey: Grey) -> NDArray[np.bool_]:
         if len(shown) and len(shown) < len(image):
             first, last = shown[[0, -1]]
             # The next row is mixed with the frame where the image was made smaller.
-            masked[: first + (first > 0)] = masked[last + (last == len(image) - 1) :] = True
+            if first > 0:
+                masked[: first + 1] = True
+            if last < len(image) - 1:
+                masked[last:] = True
     return frame
 
 

@@ -8,13 +8,15 @@ errors is a detail.
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from rdstitch.alignment.result import LinkFit, Unused, links_by_image
 from rdstitch.alignment.sentences import few_features
 from rdstitch.choices import Purpose
 from rdstitch.io.metadata import Metadata
 from rdstitch.results.messages import Severity
 from rdstitch.verification.evidence import ResultEvidence
-from rdstitch.verification.findings import Finding, Kind
+from rdstitch.verification.findings import Bodies, Finding, Images, Kind, Misfit, Value
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.overlap_check import wrong_at_most
 from rdstitch.verification.second_motions import max_plane_fraction
@@ -25,8 +27,8 @@ def _disagreeing_pairs(evidence: ResultEvidence) -> Iterator[Finding]:
     for fit in evidence.used:
         few = fit.inliers < Limits.min_pair_inlier_fraction * fit.count
         if few and not evidence.explained_by_depth(fit.images):
-            reason = _reason(evidence, fit.images, [fit], "stitch them on their own")
-            yield Finding(Kind.PAIR_MISFITS, fit.images, values={**_counts([fit]), "reason": reason})
+            values: dict[str, Value] = {**_counts([fit]), "misfit": _misfit(evidence, fit.images, [fit])}
+            yield Finding(Kind.PAIR_MISFITS, "failure", fit.images, values)
 
 
 def _misfitting_images(evidence: ResultEvidence) -> Iterator[Finding]:
@@ -39,43 +41,39 @@ def _misfitting_images(evidence: ResultEvidence) -> Iterator[Finding]:
     for k, links in sorted((k, links) for k, links in links_of.items() if evidence.alignment.used[k]):
         fits = [fit for fit in links if fit.inliers >= Limits.min_pair_inlier_fraction * fit.count]
         fits = fits or [fit for fit in links if not fit.used]
-        looked_at = (k,) if links[0].used else ()  # copies are not
+        compared = (k,) if links[0].used else None  # copies are not
         counts = _counts(fits)
         few = counts["inliers"] < Limits.min_image_inlier_fraction * counts["count"]
-        if few and not evidence.explained_by_depth(looked_at):
-            yield Finding(Kind.IMAGE_MISFITS, (k,), values={**counts, "reason": _reason(evidence, (k,), fits)})
+        if few and not evidence.explained_by_depth(compared):
+            values: dict[str, Value] = {**counts, "misfit": _misfit(evidence, (k,), fits)}
+            yield Finding(Kind.IMAGE_MISFITS, "failure", (k,), values)
 
 
 def _matches_disagree(evidence: ResultEvidence) -> Iterator[Finding]:
     counts = _counts(evidence.used)
     few = counts["inliers"] < Limits.min_pair_inlier_fraction * counts["count"]
-    if few and not evidence.explained_by_depth(()):
-        yield Finding(Kind.MATCHES_DISAGREE, values=counts)
+    if few and not evidence.explained_by_depth(None):
+        yield Finding(Kind.MATCHES_DISAGREE, "failure", (), counts)
 
 
 def _counts(fits: Sequence[LinkFit]) -> dict[str, int]:
     return {"inliers": sum(fit.inliers for fit in fits), "count": sum(fit.count for fit in fits)}
 
 
-def _reason(evidence: ResultEvidence, images: Sequence[int], fits: Sequence[LinkFit], remedy: str = "") -> str:
-    """Why matches agree with each other only."""
-    few = [(evidence.registration.sources[k].name, few_features(evidence.registration.keypoints, k)) for k in images]
-    if any(why for _, why in few):
-        return ", ".join(f"{name} has {why}" for name, why in few if why)
-    why = "they fit each other: does it show another surface, or come from another camera or zoom?"
-    if sum(fit.count for fit in fits) < Limits.few_matches:
-        why = "too few to place it: little overlap, or none?"
-    return f"{why} {remedy}".strip()
+def _misfit(evidence: ResultEvidence, images: Sequence[int], fits: Sequence[LinkFit]) -> Misfit:
+    if any(few_features(evidence.registration.keypoints, k) for k in images):
+        return Misfit.FEW_FEATURES
+    return Misfit.FEW_MATCHES if sum(fit.count for fit in fits) < Limits.few_matches else Misfit.OTHER_MOTION
 
 
 def _mixed_lenses(evidence: ResultEvidence) -> Iterator[Finding]:
     """Two lenses whose images were not separated: it is not clear which are whose, or each has one image only."""
     mixed = evidence.registration.mixed
     if mixed is not None and not mixed.certain:
-        images1, images2 = ([k for k, other in enumerate(mixed.second) if other == which] for which in (False, True))
+        images1, images2 = (Images(np.flatnonzero(mixed.second == which).tolist()) for which in (False, True))
         lens1, lens2 = mixed.distortion
-        values = {"images1": images1, "images2": images2, "lens1": lens1, "lens2": lens2}
-        yield Finding(Kind.LENSES_MIXED, values=values)
+        values: dict[str, Value] = {"images1": images1, "images2": images2, "lens1": lens1, "lens2": lens2}
+        yield Finding(Kind.LENSES_MIXED, "failure", (), values)
 
 
 def _errors(evidence: ResultEvidence) -> Iterator[Finding]:
@@ -89,15 +87,15 @@ def _errors(evidence: ResultEvidence) -> Iterator[Finding]:
     # Without what neighbours have in common, errors are those of a plane.
     explained = rms <= largest and rms**2 - relief.size**2 <= (Limits.max_rms * threshold) ** 2
     # Where the pixels agree, depth that one surface does not explain has been found a place all the same.
-    rough = (rms <= Limits.max_rough_rms * threshold and evidence.alike_fraction >= Limits.min_alike_fraction) or (
-        relief.found and explained and evidence.alike_fraction >= Limits.min_clearly_alike_fraction
+    rough = (rms <= Limits.max_rough_rms * threshold and evidence.is_alike(Limits.min_alike_fraction)) or (
+        relief.found and explained and evidence.is_alike(Limits.min_clearly_alike_fraction)
     )
     values = {"rms": rms, "threshold": threshold}
     if worst is not None and (rough or evidence.purpose.picture):
-        severity = _warning_if(evidence.flat or _depth_seen(evidence))
-        yield Finding(Kind.ROUGH, worst.images, severity, values)
+        severity = _warning_if(evidence.held_by_three or _depth_seen(evidence))
+        yield Finding(Kind.ROUGH, severity, worst.images, values)
     elif not evidence.purpose.picture:
-        yield Finding(Kind.ERRORS, values=values)
+        yield Finding(Kind.ERRORS, "failure", (), values)
 
 
 def _depth(evidence: ResultEvidence) -> Iterator[Finding]:
@@ -107,13 +105,13 @@ def _depth(evidence: ResultEvidence) -> Iterator[Finding]:
         kind = Kind.DEPTH_OF_A_TURN if evidence.alignment.on_sphere else Kind.RELIEF
         # Even where seams hold a bent plane adds up from image to image, and tilts take most of it up.
         bent = not evidence.purpose.picture or relief.size > Limits.max_shared_error * evidence.threshold
-        severity = _warning_if((evidence.flat and bent) or _depth_seen(evidence))
-        yield Finding(kind, worst.images, severity, {"what": relief.explanation, "rms": worst.rms})
+        severity = _warning_if((evidence.held_by_three and bent) or _depth_seen(evidence))
+        yield Finding(kind, severity, worst.images, {"relief": relief, "rms": worst.rms})
 
 
 def _depth_seen(evidence: ResultEvidence) -> bool:
     """Whether depth leaves the images unlike; pictures have their seams."""
-    return not evidence.purpose.picture and evidence.alike_fraction < Limits.min_alike_fraction
+    return not evidence.purpose.picture and not evidence.is_alike(Limits.min_alike_fraction)
 
 
 def _warning_if(warns: bool) -> Severity:
@@ -123,23 +121,22 @@ def _warning_if(warns: bool) -> Severity:
 def _free_homographies(evidence: ResultEvidence) -> Iterator[Finding]:
     """A homography for each of three or more images: their chain bends with whatever is not modelled."""
     alignment, worst = evidence.alignment, evidence.worst
-    if worst is not None and evidence.flat and alignment.focal is None:
-        yield Finding(Kind.FREE_HOMOGRAPHIES, worst.images, _warning_if(alignment.relief.found))
+    if worst is not None and evidence.held_by_three and alignment.focal is None:
+        yield Finding(Kind.FREE_HOMOGRAPHIES, _warning_if(alignment.relief.found), worst.images)
 
 
 def _unlike(evidence: ResultEvidence) -> Iterator[Finding]:
-    """Images that were put together and are no more alike there than by chance; of a picture also at a coarse scale,
-    as depth shifts what it shows by a little nearly everywhere.
+    """Images that were put together and are no more alike there than by chance.
+
+    Those of a picture neither at a coarse scale: depth shifts what it shows by a little nearly everywhere.
     """
     for link in evidence.checked:
-        alike = evidence.purpose.picture and link.agreement.coarse_similarity >= Limits.min_plane_fraction
-        if (
-            link.agreement.cells >= Limits.min_cells
-            and link.agreement.confirming_fraction < Limits.max_unlike_fraction
-            and not alike
-        ):
-            values = {"confirming": link.agreement.confirming, "cells": link.agreement.cells}
-            yield Finding(Kind.UNLIKE, link.pair, "failure", values)
+        agreement = link.agreement
+        alike = evidence.purpose.picture and agreement.coarse_similarity >= Limits.min_plane_fraction
+        fraction = agreement.confirming_fraction
+        if fraction is not None and fraction < Limits.max_unlike_fraction and not alike:
+            values = {"confirming": agreement.confirming, "cells": agreement.cells}
+            yield Finding(Kind.UNLIKE, "failure", link.pair, values)
 
 
 def _compared_overlaps(evidence: ResultEvidence) -> Iterator[Finding]:
@@ -147,38 +144,36 @@ def _compared_overlaps(evidence: ResultEvidence) -> Iterator[Finding]:
     checked, wrong_fraction = evidence.checked, wrong_at_most(evidence.checked)
     if wrong_fraction < Limits.max_wrong_overlaps:
         sampled = sum(link.sampled for link in checked)
-        values = {"of": len(evidence.used), "count": len(checked), "sampled": sampled, "share": wrong_fraction}
-        yield Finding(Kind.OVERLAPS_SAMPLED, (), "detail", values)
+        values = {"of": len(evidence.used), "count": len(checked), "sampled": sampled, "fraction": wrong_fraction}
+        yield Finding(Kind.OVERLAPS_SAMPLED, "detail", (), values)
 
 
 def _ambiguous(evidence: ResultEvidence) -> Iterator[Finding]:
     for pair, link in evidence.ambiguous.items():
-        yield Finding(Kind.AMBIGUOUS, pair, values={"shift": link.ambiguity.shift})
+        yield Finding(Kind.AMBIGUOUS, "failure", pair, {"shift": link.ambiguity.shift})
 
 
 def _pattern(evidence: ResultEvidence) -> Iterator[Finding]:
     """A pattern over so many pairs that leaving some of them out proves nothing; or one in which the unique decided."""
     if len(evidence.ambiguous) > Limits.max_ambiguous_pairs * len(evidence.checked):
-        yield Finding(Kind.PATTERN, values={"count": len(evidence.ambiguous), "of": len(evidence.checked)})
-    settled = [link for link in evidence.checked if link.unique]
-    if settled:
-        yield Finding(
-            Kind.SETTLED_PATTERN, min(settled, key=lambda link: link.agreement.confirming_fraction).pair, "warning"
-        )
+        yield Finding(Kind.PATTERN, "failure", (), {"count": len(evidence.ambiguous), "of": len(evidence.checked)})
+    if settled := [link for link in evidence.checked if link.decided_by_unique_content]:
+        least_alike = min(settled, key=lambda link: link.agreement.confirming / max(link.agreement.cells, 1))
+        yield Finding(Kind.SETTLED_PATTERN, "warning", least_alike.pair)
 
 
 def _rival_motion(evidence: ResultEvidence) -> Iterator[Finding]:
     """Poses by something that fills less than half of the images: what drives ahead, say."""
     fraction = max_plane_fraction(link.agreement for link in evidence.checked)
     if fraction < Limits.min_plane_fraction:
-        yield Finding(Kind.RIVAL_MOTION, values={"share": fraction})
+        yield Finding(Kind.RIVAL_MOTION, "failure", (), {"fraction": fraction})
 
 
 def _two_left(evidence: ResultEvidence) -> Iterator[Finding]:
     """Two images without a third, taken for one of another lens, which is all that tells a curved wall from a plane."""
     used = evidence.alignment.used
     if evidence.registration.mixed is not None and used.sum() == 2:
-        yield Finding(Kind.TWO_OF_ONE_LENS, tuple(used.nonzero()[0].tolist()), "warning")
+        yield Finding(Kind.TWO_OF_ONE_LENS, "warning", tuple(used.nonzero()[0].tolist()))
 
 
 def _inputs(evidence: ResultEvidence) -> Iterator[Finding]:
@@ -193,12 +188,13 @@ def _inputs(evidence: ResultEvidence) -> Iterator[Finding]:
             bodies.setdefault(" ".join(filter(None, (header.make, header.model, header.serial))), []).append(k)
     ratio, near, far = focal_ratio(header for _, header in headers)
     if len(bodies) > 1:
-        yield Finding(Kind.SEVERAL_CAMERAS, (), "warning", {"bodies": bodies})
+        by_body = Bodies({body: Images(images) for body, images in bodies.items()})
+        yield Finding(Kind.SEVERAL_CAMERAS, "warning", (), {"number": len(bodies), "bodies": by_body})
     elif ratio > Limits.max_focal_ratio:
-        yield Finding(Kind.ZOOMED, (), "warning", {"ratio": ratio, "near": near, "far": far})
-    without = [k for k, source in enumerate(sources) if source.mask is None]
+        yield Finding(Kind.ZOOMED, "warning", (), {"ratio": ratio, "near": Images([near]), "far": Images([far])})
+    without = Images(k for k, source in enumerate(sources) if source.mask is None)
     if 0 < len(without) < len(sources):
-        yield Finding(Kind.UNMASKED, (), "warning", {"without": without})
+        yield Finding(Kind.UNMASKED, "warning", (), {"count": len(without), "of": len(sources), "without": without})
 
 
 def focal_ratio(headers: Iterable[Metadata]) -> tuple[float, int, int]:

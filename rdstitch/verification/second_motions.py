@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +26,15 @@ from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.photometric_agreement import Agreement, overlap_agreement
 
 
+class _Candidate(NamedTuple):
+    """A motion of a pair that may be that of the plane."""
+
+    motion: RadialHomography
+    plane_fraction: float  # of the images, that it fills at most
+
+
 def planes_of_pairs(registration: Registration, threshold: float, threads: int = 1) -> list[PairRegistration] | None:
-    """Every pair by that of its two strongest motions which may fill more than half of its images.
+    """Replace the motion of each pair by that of its two strongest which may fill more than half of its images.
 
     Each pair decides for itself: where two motions are about as strong, some pairs were registered by one and some by
     the other, and no alignment holds both. None where no pair has a motion that fills less. ``threads``: pairs whose
@@ -35,43 +43,47 @@ def planes_of_pairs(registration: Registration, threshold: float, threads: int =
     pairs = [pair for pair in registration.pairs if pair.relation]
     images = ComparedImages(registration.sources, registration.stretch, threads)
 
-    def fills(pair: Pair, motion: RadialHomography) -> tuple[float, RadialHomography]:
+    def candidate(pair: Pair, motion: RadialHomography) -> _Candidate:
         first = images.placed(pair[0], motion.camera, motion.homography)
-        return max_plane_fraction([overlap_agreement(first, images.placed(pair[1], motion.camera2, np.eye(3)))]), motion
+        agreement = overlap_agreement(first, images.placed(pair[1], motion.camera2, np.eye(3)))
+        return _Candidate(motion, max_plane_fraction([agreement]))
 
-    def filled_by(motions: Mapping[Pair, RadialHomography]) -> dict[Pair, tuple[float, RadialHomography]]:
+    def candidates(motions: Mapping[Pair, RadialHomography]) -> dict[Pair, _Candidate]:
         with ThreadPoolExecutor(threads) as pool:
-            return dict(zip(motions, pool.map(fills, motions, motions.values()), strict=True))
+            return dict(zip(motions, pool.map(candidate, motions, motions.values()), strict=True))
 
     half = Limits.min_plane_fraction
-    planes = filled_by({pair.images: pair.relation for pair in pairs})
-    if all(fraction >= half for fraction, _ in planes.values()):
+    best = candidates({pair.images: pair.relation for pair in pairs})
+    if all(each.plane_fraction >= half for each in best.values()):
         return None
-    for pair, filled in filled_by(second_motions(registration.alignment.cameras, pairs, threshold)).items():
-        planes[pair] = max(planes[pair], filled, key=lambda each: each[0])
-    needed = bottleneck_fraction({pair: fraction for pair, (fraction, _) in planes.items() if fraction >= half})
+    for pair, second in candidates(second_motions(registration.alignment.cameras, pairs, threshold)).items():
+        best[pair] = max(best[pair], second, key=lambda each: each.plane_fraction)
+    fractions = {pair: each.plane_fraction for pair, each in best.items()}
+    needed = bottleneck_fraction({pair: fraction for pair, fraction in fractions.items() if fraction >= half})
     return [
-        replace(pair, relation=planes[pair.images][1] if planes[pair.images][0] >= needed else _no_plane(pair))
-        if pair.images in planes
+        replace(pair, relation=best[pair.images].motion if fractions[pair.images] >= needed else _no_plane(pair))
+        if pair.images in best
         else pair
         for pair in registration.pairs
     ]
 
 
-def bottleneck_fraction(fills: Mapping[Pair, float]) -> float:
-    """The share from which on pairs join all images that all of them join: those of less may show anything."""
-    if not fills:
+def bottleneck_fraction(plane_fractions: Mapping[Pair, float]) -> float:
+    """The largest fraction that pairs may be required to have and still join all images that all of them join."""
+    if not plane_fractions:
         return math.inf
-    first, second = np.array(list(fills)).T
-    graph = sparse.coo_array((-np.array(list(fills.values())), (first, second)), (max(map(max, fills)) + 1,) * 2)
+    first, second = np.array(list(plane_fractions)).T
+    size = max(map(max, plane_fractions)) + 1
+    graph = sparse.coo_array((-np.array(list(plane_fractions.values())), (first, second)), (size, size))
     return -float(csgraph.minimum_spanning_tree(graph.tocsr()).data.max())
 
 
 def second_motions(
     cameras: Sequence[Camera], pairs: Sequence[PairRegistration], threshold: float
 ) -> Mapping[Pair, RadialHomography]:
-    """Of each pair the motion that most of the matches agree on that its own does not explain, with its own λ: that of
-    a vehicle, whose image hardly changes, says nothing.
+    """Estimate of each pair the motion of most matches that its first motion does not explain.
+
+    It has a λ of its own: that of a vehicle, whose image hardly changes, says nothing.
     """
     result = {}
     rests = {pair.images: np.flatnonzero(~pair.relation.inliers) for pair in pairs}
@@ -92,7 +104,7 @@ def second_motions(
 
 
 def max_plane_fraction(compared: Iterable[Agreement]) -> float:
-    """Share of the images of some pairs that is not seen to contradict a motion, in [0, 1]."""
+    """Fraction of the images of some pairs that is not seen to contradict a motion, in [0, 1]."""
     agreements = list(compared)
     return 1.0 - sum(each.unlike_cells for each in agreements) / max(sum(each.textured_cells for each in agreements), 1)
 

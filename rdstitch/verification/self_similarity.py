@@ -106,7 +106,7 @@ def placement_ambiguity(first: Drawing, second: Drawing, longest_side: int = MAX
     enough = overlaps.area >= Limits.min_kept_overlap * most
     other = np.where(peak & (distance > reduction * _MIN_SHIFT) & enough, score, np.float32(0.0))
     best = int(other.argmax())
-    elsewhere = float(other.flat[best]) and _between_pixels(score, *np.unravel_index(best, score.shape))
+    elsewhere = _between_pixels(score, *np.unravel_index(best, score.shape)) if other.flat[best] else 0.0
     return Ambiguity(float(score[near].max()), elsewhere, float(distance.flat[best]) / longest_side)
 
 
@@ -149,7 +149,7 @@ class Overlaps:
 
     @classmethod
     def of(cls, first: Grey, second: Grey) -> "Overlaps":
-        """By the convolution theorem."""
+        """The sums of two images, by the convolution theorem."""
         height, width = (a + b - 1 for a, b in zip(first.shape, second.shape, strict=True))
         a, aa, am = _spectra(first[::-1, ::-1], height, width)
         b, bb, bm = _spectra(second, height, width)
@@ -170,7 +170,7 @@ class Overlaps:
 
 
 def _spectra(image: Grey, height: int, width: int) -> list[Grey]:
-    """Of the values, their squares, and where there are any, in OpenCV's packed format."""
+    """Spectra of the values, of their squares, and of where there are any, in OpenCV's packed format."""
     seen = np.isfinite(image)
     values = np.where(seen, image, np.float32(0.0))
     shape = (cv2.getOptimalDFTSize(height), cv2.getOptimalDFTSize(width))

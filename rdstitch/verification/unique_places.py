@@ -20,12 +20,13 @@ from rdstitch.verification.photometric_agreement import COMPARED_SIDE, ComparedI
 from rdstitch.verification.self_similarity import Drawing, Overlaps, draw, drawing_scale
 
 _MIN_SHIFT = 10  # pixels: a shorter shift is no period that could be told from the peak itself
-_OWN_OVERLAP, _OVERLAP = 0.15, 0.05  # of an image, that a shift must keep; of two, of the most that one keeps
+_OWN_OVERLAP = 0.15  # fraction of an image that a shift over itself must keep
+_OVERLAP = 0.05  # of the most that a shift of two images over each other keeps
 _MAX_PERIODS = 16  # shifts that an image is compared with itself at
 _MIN_COPIES = 3  # other copies of a place, of which the median is clean though one of them has dirt
 _MARGIN = 6  # pixels at the border of an image, where brightness cannot be removed well
 _MOST = 25.0  # spreads of the copies: a larger departure counts as this
-# Images whose drawings and departures fit into 128 MB at once.
+# Images that are compared at once: seen from above, their drawings and departures fit into 128 MB.
 IMAGES_AT_ONCE = 2**27 // (2 * COMPARED_SIDE**2 * np.dtype(np.float32).itemsize)
 
 
@@ -50,7 +51,7 @@ class UniqueShift:
 def unique_shifts(
     placed: Mapping[int, ComparedImage], pairs: Sequence[tuple[int, int]], workers: int = 1
 ) -> dict[tuple[int, int], UniqueShift]:
-    """By how much the first image of each pair must be moved for what is unique in both to agree.
+    """Compute how far the first image of each pair must be moved for what is unique in both to agree.
 
     ``placed``: the images, on a plane where a period of the pattern is the same shift everywhere (a metric or an affine
     one); ``workers``: images that are compared at the same time; gives of the pairs of which that decides, in units of
@@ -162,7 +163,7 @@ def _shifted(pixels: Grey, shift: FloatArray) -> Grey:
 
 
 def _median(copies: Grey, count: IntArray) -> Grey:
-    """Of those of the values (N, h, w) that are known, ``count`` (h, w) of them; NaN where there is none."""
+    """Median over the first axis of known values (N, h, w), of which there are ``count`` (h, w); NaN where none is."""
     ordered = np.sort(copies, axis=0)  # NaN come last
     low, high = (np.take_along_axis(ordered, (np.maximum(count - above, 0) // 2)[None], axis=0)[0] for above in (1, 0))
     return np.asarray(0.5 * (low + np.where(np.isfinite(high), high, low)), dtype=np.float32)

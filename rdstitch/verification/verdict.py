@@ -1,4 +1,4 @@
-"""Every run judges itself: can the result be relied on? ResultEvidence, rules, findings."""
+"""Every run judges itself: can the result be relied on? Evidence, rules, findings."""
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
@@ -11,7 +11,7 @@ from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.verification import rules
 from rdstitch.verification.evidence import ResultEvidence
-from rdstitch.verification.findings import Finding, Kind
+from rdstitch.verification.findings import Finding, Kind, Pairs
 
 _MAX_WARNINGS = 3  # lines of one run
 _NOT_FLAT = frozenset({Kind.FREE_HOMOGRAPHIES, Kind.ROUGH, Kind.RELIEF, Kind.DEPTH_OF_A_TURN})  # one topic
@@ -84,7 +84,7 @@ def _outvoted(suspicions: Iterable[Finding]) -> list[Finding]:
     for finding in suspicions:
         kinds[Kind.OUTVOTED_PATTERN if finding.kind is Kind.AMBIGUOUS else Kind.OUTVOTED].append(finding.images)
     return [
-        Finding(kind, tuple(sorted({k for pair in pairs for k in pair})), "detail", {"pairs": pairs})
+        Finding(kind, "detail", tuple(sorted({k for pair in pairs for k in pair})), {"pairs": Pairs(pairs)})
         for kind, pairs in kinds.items()
         if pairs
     ]

@@ -18,12 +18,13 @@ from rdstitch.io import read_image, write_image
 from rdstitch.matching import candidate_pairs
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.pipeline import accept, blocks
-from rdstitch.pipeline.recipes import stitch_found
+from rdstitch.pipeline.recipes import stitch_images
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.synthetic import Sequence
-from rdstitch.verification.findings import Finding, Kind
+from rdstitch.verification.findings import Kind
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, flight, sidecar_of, start, transfers
+from tests.registrations import finding
 from tests.sampled import sampled
 
 
@@ -125,9 +126,9 @@ def test_a_block_that_cannot_be_laid_out_is_told_of(
     def stitched(found: FoundImages, *arguments: Any, **files: Any) -> StitchResult:
         if len(found.frames) < 4:
             raise LimitError("the canvas is too large")
-        return stitch_found(found, *arguments, **files)
+        return stitch_images(found, *arguments, **files)
 
-    monkeypatch.setattr(blocks, "stitch_found", stitched)
+    monkeypatch.setattr(blocks, "stitch_images", stitched)
     how = ("mosaic", folder, "-o", tmp_path / "floor.png", "--all-blocks", "--lambda", DISTORTION)
     rdstitch(*how, *CACHED, told="no blocks after the 1 first: the canvas is too large")
 
@@ -167,7 +168,7 @@ OUTPUTS = {"pano": "out.png", "mosaic": "out.png", "calibrate": "camera.json", "
 
 
 def _pretend(monkeypatch: pytest.MonkeyPatch, *found: Message) -> None:
-    findings = tuple(Finding(Kind.ERRORS, severity=message.severity) for message in found)
+    findings = tuple(finding(Kind.ERRORS, severity=message.severity) for message in found)
     monkeypatch.setattr(accept, "judge", lambda *arguments, **options: findings)
     monkeypatch.setattr(accept, "messages_of", lambda *arguments: list(found))
 

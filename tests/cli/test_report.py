@@ -28,9 +28,10 @@ from rdstitch.report.pairs import matched
 from rdstitch.results.messages import Message, left_out
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.verification.findings import Finding, Kind
+from rdstitch.verification.findings import Kind
 from rdstitch.verification.verdict import RefusedError
 from tests.cli.running import CACHED, OPTIONS, Run, copied
+from tests.registrations import finding
 
 _VOID = {"meta", "img"}
 _SECTIONS = ["Summary", "Warnings and left-out images", "Mosaic", "Match graph", "Votes on λ", "Lens curve"]
@@ -170,7 +171,7 @@ def test_what_is_refused_is_shown(
     rdstitch: Run, frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, output: str
 ) -> None:
     said = [Message("the images <disagree>", severity="failure"), Message("look at that seam")]
-    monkeypatch.setattr(accept, "judge", lambda *arguments, **options: (Finding(Kind.ERRORS),))
+    monkeypatch.setattr(accept, "judge", lambda *arguments, **options: (finding(Kind.ERRORS),))
     monkeypatch.setattr(accept, "messages_of", lambda *arguments: said)
     report = tmp_path / "report.html"
     arguments = (command, *frames[:2], "-o", tmp_path / output, "--report", report, *CACHED)

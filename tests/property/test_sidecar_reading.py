@@ -70,6 +70,9 @@ def _write(folder: str | Path, content: bytes, name: str = "out.tif.json") -> Pa
     return file
 
 
+PLACE = {"crs": "EPSG:32631", "pixel_to_map": [[0.1, 0.0, 4e5], [0.0, -0.1, 5e6]]}
+
+
 def _sidecar(file: Path) -> None:
     saved = read_sidecar(file)
     assert saved.images[saved.reference].to_plane is not None
@@ -112,6 +115,7 @@ def test_a_good_one_is_read_whole(tmp_path: Path) -> None:
         (("images", 0, "coefficients"), [5, 0, 0], "images[0]"),
         (("images", 0, "coefficients"), [True, 0, 0], "images[0].coefficients[0]"),
         (("images", 0, "used"), 1, "images[0].used"),
+        (("output", "georeference"), {**PLACE, "crs": "EPSG:9999"}, "output.georeference"),
         (("images", 0, "focal_source"), "guesswork", "images[0].focal_source"),
         (("images", 0, "to_plane"), [[1, 0, 0], [0, 1, 0], [1, 1, 0]], "images[0]"),
         (("images", 0, "to_plane"), [[1, 0, 0], [0, "1", 0], [0, 0, 1]], "images[0].to_plane[1][1]"),

@@ -181,7 +181,7 @@ class Structure:
     @classmethod
     def of(cls, observations: Observations, free: BoolArray) -> Self:
         """By the images of the links."""
-        image1, image2, moving = observations.image1, observations.image2, free.any(axis=1)
+        image1, image2, moving = observations.image1, observations.image2, np.asarray(free.any(axis=1))
         joined = moving[image1] & moving[image2]
         starts = range(0, len(observations), _LINKS_AT_ONCE)
         parts = [slice(first, min(first + _LINKS_AT_ONCE, len(observations))) for first in starts]
@@ -192,9 +192,9 @@ class Structure:
 def _sums(images: IntArray) -> tuple[IntArray, "sparse.csr_array"]:
     """The images of some links (l,), each once, and the matrix that sums rows of the links for each of them."""
     order = np.argsort(images, kind="stable")
-    found, first = np.unique(images[order], return_index=True)
-    shape = len(found), len(images)
-    return found, sparse.csr_array((np.ones(len(images)), order, np.append(first, len(images))), shape)
+    present, first = np.unique(images[order], return_index=True)
+    shape = len(present), len(images)
+    return present, sparse.csr_array((np.ones(len(images)), order, np.append(first, len(images))), shape)
 
 
 def assemble(

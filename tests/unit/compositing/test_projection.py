@@ -9,6 +9,7 @@ import pytest
 from examples.worlds.compositing_scenes import as_image, gradient, grey, place_images
 from examples.worlds.turns import TurningSequence, camera_rotations, turning_sequence
 from rdstitch.arrays import FloatArray
+from rdstitch.choices import ProjectionName
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
 from rdstitch.compositing.canvas import plan_canvas
 from rdstitch.compositing.compositor import photo_sphere_xmp
@@ -48,7 +49,7 @@ def _composed(
 
 
 @pytest.mark.parametrize("name", PROJECTIONS)
-def test_directions_come_back(name: str) -> None:
+def test_directions_come_back(name: ProjectionName) -> None:
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(200, 3))
     directions[:, 2] = np.abs(directions[:, 2]) if name == "plane" else directions[:, 2]
@@ -107,7 +108,7 @@ def test_a_gap_that_is_open_between_closed_corners_lies_at_the_border(heading: f
 
 @pytest.mark.parametrize("name", [name for name in PROJECTIONS if name != "plane"])
 @pytest.mark.parametrize("rotate", [0.0, 15.0])
-def test_points_of_an_image_come_back_through_the_warp(name: str, rotate: float) -> None:
+def test_points_of_an_image_come_back_through_the_warp(name: ProjectionName, rotate: float) -> None:
     rotations = camera_rotations([0.4, -0.5], [0.2, -0.1], [0.1, 0.2])
     directions = _directions(rotations)
     canvas = plan_panorama([LENS] * 2, directions, projection=name, rotate=rotate)
@@ -133,7 +134,7 @@ def test_what_a_projection_cannot_show_is_refused_by_name() -> None:
 
 
 @pytest.mark.parametrize("name", ["plane", "cylinder", "mercator"])
-def test_nothing_is_stretched_beyond_the_limit(name: str) -> None:
+def test_nothing_is_stretched_beyond_the_limit(name: ProjectionName) -> None:
     rotations = camera_rotations([-0.6, -0.2, 0.2, 0.6], [0.0, 0.6, 0.6, 0.0], 0.05)
     directions = _directions(rotations)
     free = plan_panorama([LENS] * 4, directions, projection=name, reference=0)

@@ -17,6 +17,7 @@ from rdstitch.export.write_trajectory import write_trajectory
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
 from rdstitch.inputs.rosbag import opened_bag
+from rdstitch.io import read_image, write_image
 from rdstitch.results.pose import FollowedPoses, Pose
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs
@@ -37,6 +38,22 @@ def test_the_memory_of_a_map_is_that_of_the_turned_strip(tmp_path: Path) -> None
     strip = replace(strip, registration=registered, canvas=replace(strip.canvas, size=(6000, 60)))
     with pytest.raises(LimitError, match=r"map of 42[89]\d x 42[89]\d pixels"), Outputs(overwrite=False) as outputs:
         write_map(strip, tmp_path, 1.0, outputs)
+
+
+def test_a_map_of_deep_images_has_all_greys_of_what_they_show(tmp_path: Path) -> None:
+    """What is beside the images is 0, and far from what a thermal camera measures."""
+    strip = stitched(registration(2), tmp_path / "strip.png")
+    width, height = strip.canvas.size
+    samples = np.zeros((height, width, 2), dtype=np.uint16)
+    samples[20:-20, 20:-20] = 21_000, 65_535
+    samples[20 : height // 2, 20:-20, 0] = 20_000
+    write_image(strip.output, samples[..., 0], (samples[..., 1] // 257).astype(np.uint8))
+    with Outputs(overwrite=False) as outputs:
+        outputs.make_folder(tmp_path / "map")
+        write_map(strip, tmp_path / "map", 1.0, outputs)
+    written = read_image(tmp_path / "map" / "map.png")
+    shown = written.pixels[written.alpha == 255]
+    assert min(np.mean(shown < 5), np.mean(shown > 250)) > 0.4
 
 
 def _result(names: list[str], cameras: list[Camera]) -> StitchResult:
@@ -60,6 +77,15 @@ def test_images_of_two_cameras_are_not_given_one(other: Camera) -> None:
         poses_file(_result(["a.jpg", "b.jpg"], [CAMERA, other]), "images.txt")
     same = poses_file(_result(["a.jpg", "b.jpg"], [CAMERA, replace(CAMERA, tilt=(0.1, 0.0))]), "images.txt")
     assert [line.split()[-2:] for line in same.splitlines()[1::2]] == [["1", "a.jpg"], ["1", "b.jpg"]]
+
+
+def test_an_image_that_is_left_out_needs_no_camera_of_colmap() -> None:
+    sources = [source("a.jpg"), source("b.jpg"), source("left out.jpg", orientation=6)]
+    poses, used = registration(sources).alignment.poses, np.array([True, True, False])
+    poses = replace(poses, yaw=np.where(used, poses.yaw, np.nan))
+    cameras = (CAMERA, CAMERA, CAMERA.turned(6))
+    text = poses_file(stitched(registration(sources, cameras=cameras, used=used, poses=poses)), "images.txt")
+    assert [line.split()[-1] for line in text.splitlines()[1::2]] == ["a.jpg", "b.jpg"]
 
 
 @pytest.mark.parametrize("file", ["images.txt", "geo.txt"])

@@ -196,12 +196,19 @@ def test_what_opencv_lacks(monkeypatch: pytest.MonkeyPatch, remove: Callable[[py
         detect(np.zeros((50, 50), np.uint8), FeatureOptions(kind="orb"))
 
 
+def test_a_fourth_band_of_a_view_is_no_alpha() -> None:
+    bands = np.zeros((40, 50, 4), np.uint8)
+    assert prepare(View(bands), None).clearance is None
+    assert prepare(View.of(bands), None).clearance is not None
+
+
 def test_bad_arguments_are_refused(image: NDArray[np.uint8]) -> None:
     for options in ({"kind": "surfing"}, {"max_features": 0}, {"work_megapixels": -1.0}):
         with pytest.raises(ArgumentError):
             FeatureOptions(**options)
-    with pytest.raises(ArgumentError, match="mask of shape"):
-        detect(image, mask=np.ones((3, 3), bool))
+    for masked in (image, np.dstack([image, image])):
+        with pytest.raises(ArgumentError, match="mask of shape"):
+            detect(masked, mask=np.ones((3, 3), bool))
     for bad in (np.zeros((0, 5), np.uint8), np.zeros((5, 5, 5, 5), np.uint8), np.zeros(5, np.uint8)):
         with pytest.raises(ArgumentError, match="expected an image"):
             detect(bad)

@@ -135,6 +135,31 @@ def test_micro_manager_says_it_in_a_tag_or_beside_folders(tmp_path: Path) -> Non
     assert tiles[1].read(0, 0)[0][0, 0].tolist() == [2, 3]
 
 
+def test_metadata_that_cannot_be_read_beside_tiles_says_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "a.png"
+    file.write_bytes(b"")
+    for text in ("[" * 100_000, "[1]", '{"Metadata-a.png": 1}', "{"):
+        (tmp_path / "metadata.txt").write_text(text, encoding="utf-8")
+        (tile,) = stored_tiles([file])
+        assert tile.is_plain
+        assert tile.position is None
+
+
+def test_files_are_told_from_other_tiles_in_one_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stack = tmp_path / "stack.tif"
+    tifffile.imwrite(stack, _planes(2), metadata=None)
+    frames = [Frame(stack), *(Frame(tmp_path / f"{k}.png") for k in range(30))]
+    compared = list[Path]()
+
+    def counted(path: Path) -> int:
+        compared.append(path)
+        return hash(str(path))
+
+    monkeypatch.setattr(Path, "__hash__", counted)
+    tile_frames(frames, 0, None)
+    assert len(compared) < 20 * len(frames)
+
+
 def test_an_overview_beside_an_image_is_no_plane(tmp_path: Path) -> None:
     file = tmp_path / "pyramid.tif"
     with tifffile.TiffWriter(file) as tiff:

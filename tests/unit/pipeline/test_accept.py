@@ -8,6 +8,7 @@ import pytest
 
 from examples.worlds.alignment_scenes import grid, scene
 from rdstitch.alignment import AlignmentOptions
+from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.alignment.result import Unused
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import LensName, Purpose
@@ -125,7 +126,9 @@ def _registered(link: Link) -> PairRegistration:
 def curved() -> tuple[Aligner, list[PairRegistration], list[Link]]:
     rng = np.random.default_rng(0)
     given = scene(grid(4, 3, (0.4, 0.35), np.pi, rng), lens=FISHEYE, rng=rng, noise=0.25, focal=420.0)
-    aligner = Aligner(tuple(map(str, range(12))), tuple(given.cameras), AlignmentOptions(), NO_CACHE, 3.0)
+    aligner = Aligner(
+        tuple(map(str, range(12))), tuple(given.cameras), AlignmentOptions(), NO_CACHE, 3.0, QuarterTurns((1,) * 12)
+    )
     return aligner, [_registered(link) for link in given.links], given.links
 
 

@@ -75,7 +75,7 @@ def test_what_a_copy_alone_has_is_given_of_its_image() -> None:
 
 def test_a_position_keeps_its_accuracy_beside_a_copy_that_has_a_better_one() -> None:
     options = AlignmentOptions(positions=[[0.0, 0.0], [9.0, 5.0]], positions_std=[np.nan, 0.02])
-    aligner = Aligner(("a", "b"), (Camera((640, 480)),) * 2, options, NO_CACHE, 3.0)
+    aligner = Aligner(("a", "b"), (Camera((640, 480)),) * 2, options, NO_CACHE, 3.0, QuarterTurns((1,) * 2))
     found = aligner._options_without({1: 0})
     np.testing.assert_array_equal(found.positions, options.positions)
     np.testing.assert_array_equal(found.positions_std, options.positions_std)
@@ -106,7 +106,7 @@ def test_a_near_copy_over_relief_or_blurred_is_counted_once(relief: float, noise
     copy = replace(copy, relation=replace(copy.relation, homography=np.eye(3)))
     pairs = [_registered(link) for link in (*links, *again, copy)]
     options = AlignmentOptions(model="auto", lens="division")
-    aligner = Aligner(tuple("abcdefgh"), (given.cameras[0],) * 8, options, NO_CACHE, 3.0)
+    aligner = Aligner(tuple("abcdefgh"), (given.cameras[0],) * 8, options, NO_CACHE, 3.0, QuarterTurns((1,) * 8))
     found = aligner.align(pairs).alignment
     assert found.used.all()
     assert {fit.reason for fit in found.links if 6 in fit.images} == {Unused.COPY}
@@ -142,7 +142,9 @@ def test_the_model_is_chosen_again_only_where_more_pairs_disagree(
         return chosen[-1]
 
     monkeypatch.setattr("rdstitch.alignment.recipe.select_model", counted)
-    aligner = Aligner(tuple(map(str, range(24))), tuple(given.cameras), AlignmentOptions(), NO_CACHE, 3.0)
+    aligner = Aligner(
+        tuple(map(str, range(24))), tuple(given.cameras), AlignmentOptions(), NO_CACHE, 3.0, QuarterTurns((1,) * 24)
+    )
     found = draft_with_loops(aligner, cast(PairEstimator, Estimator()), pairs, [])
     assert len(chosen) == selections
     assert len(found.pairs) == len(given.links)

@@ -21,11 +21,12 @@ from rdstitch.pipeline.flat_field import with_flat_field
 from rdstitch.stage import SearchPlan, TileRegistration, register_tiles
 from rdstitch.stage.axes import with_measured_axes
 from rdstitch.stage.coarse_tile import coarse_tile
-from rdstitch.stage.estimate_flat_field import estimate_illumination
+from rdstitch.stage.estimate_flat_field import FlatFieldUnknown, Illumination, estimate_illumination
 from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.overlap import Overlap
 from rdstitch.stage.phase_correlation import correlate
 from rdstitch.stage.positions import Scan, grid_from_names, grid_from_table, grid_from_tiles
+from rdstitch.stage.sentences import axes_contradicted
 
 
 @pytest.mark.parametrize(("side", "degrees"), [(3, 0.0), (20, 2.3), (60, 0.8), (20, -15.0)])
@@ -55,13 +56,16 @@ def test_a_flat_field_is_finite_and_its_page_is_named(tmp_path: Path, page: int)
 def test_shading_of_a_third_is_found_to_a_percent(specimen: Specimen, rows: int, tile: int, seed: int) -> None:
     stage = StageGrid(rows=rows, columns=rows, tile=tile, specimen=specimen, content=0.5, seed=seed)
     shown = estimate_illumination(stage.render, len(stage))
+    assert isinstance(shown, Illumination)
     off = shown.field.gain / stage.flat_field - 1.0
     assert np.sqrt((off**2).mean()) < min(0.01, 3.0 * shown.error)
     if specimen == "fluorescence":
-        assert shown.dark[0] == pytest.approx(100.0, abs=6.0)
+        (dark,) = shown.dark
+        assert dark is not None
+        assert dark.level == pytest.approx(100.0, abs=6.0)
     # Few tiles that show other things have none.
     few = StageGrid(rows=1, columns=2, tile=256, content=0.5, seed=3)
-    assert estimate_illumination(few.render, 2).field is None
+    assert estimate_illumination(few.render, 2) is FlatFieldUnknown.FEW_TILES
 
 
 _STRIPS: tuple[Any, ...] = np.s_[:40], np.s_[:9], np.s_[:, 200:220]
@@ -74,10 +78,11 @@ def test_narrow_tiles_show_their_flat_field_too_or_say_that_they_do_not(specimen
     tiles = [stage.render(index) for index in range(len(stage))]
     strips = [[tile[part] for tile in tiles] for part in _STRIPS]
     found = [estimate_illumination(every.__getitem__, len(stage)) for every in strips]
-    assert sum(each.field is not None for each in found) == shown
+    assert sum(each is not FlatFieldUnknown.UNSURE for each in found) == shown
     for part, each in zip(_STRIPS, found, strict=True):
         expected = stage.flat_field[part] / stage.flat_field[part].mean(axis=(0, 1))
-        assert each.field is None or np.sqrt(((each.field.gain / expected - 1.0) ** 2).mean()) < 2.0 * each.error
+        if isinstance(each, Illumination):
+            assert np.sqrt(((each.field.gain / expected - 1.0) ** 2).mean()) < 2.0 * each.error
 
 
 def test_what_is_read_before_the_flat_field_is_known_is_corrected_too(tmp_path: Path) -> None:
@@ -188,11 +193,14 @@ def test_axes_and_overlap_are_those_that_the_tiles_show(
     told = stage.nominal @ np.array(matrix, float) * 0.9
     grid = TileGrid(told - told.min(axis=0), (256, 256))
     read = lambda index: coarse_tile(stage.render(index), 1)  # noqa: E731
-    shown, words = with_measured_axes(grid, read, 1, 12.8)
+    shown, axes = with_measured_axes(grid, read, 1, 12.8)
     assert np.abs(shown.places - stage.nominal).max() < 12.0
-    assert "neighbours overlap by 1" in words
+    (x, y), (u, v) = np.sign(np.round(matrix))
+    assert [axes[k].swapped for k in (0, 1)] == [x == 0, v == 0]
+    assert [axes[k].mirrored for k in (0, 1)] == [x + u < 0, y + v < 0]
+    assert "neighbours overlap by 1" in axes_contradicted("--grid", axes).text
     right = TileGrid(stage.nominal, (256, 256))
-    assert with_measured_axes(right, read, 1, 12.8) == (right, "")
+    assert with_measured_axes(right, read, 1, 12.8) == (right, {})
 
 
 def _array(rng: np.random.Generator) -> tuple[list[NDArray[np.float32]], FloatArray]:
@@ -210,7 +218,7 @@ def test_tiles_of_a_pattern_without_anything_unique_stay_where_the_stage_was_sen
     tiles, places = _array(np.random.default_rng(4))
     nominal = np.array([(270.0 * c, 220.0 * r) for r in range(2) for c in range(3)])
     grid = TileGrid(nominal, (320, 256))
-    assert with_measured_axes(grid, lambda index: coarse_tile(tiles[index], 1), 1, 16.0)[1] == ""
+    assert with_measured_axes(grid, lambda index: coarse_tile(tiles[index], 1), 1, 16.0)[1] == {}
     found = register_tiles(SearchPlan.of(grid), tiles.__getitem__)
     off = found.adjustment.places - places
     assert np.abs(off - np.median(off, axis=0)).max() < 5.0

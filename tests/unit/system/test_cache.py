@@ -21,7 +21,7 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.system import cache
-from rdstitch.system.cache import Cache, Stored
+from rdstitch.system.cache import Cache, InMemory, OnDisk
 from rdstitch.system.packing import digest, pack, unpack
 from rdstitch.system.temporary_folder import TemporaryFolder
 
@@ -139,8 +139,10 @@ def _nothing_recent(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cache, "_recent", cache._RecentlyUsed(0))
 
 
-def _kept(folder: Path, name: str, value: float) -> Stored[tuple[float]]:
-    return Cache.at(folder).stored("stage", (name,), lambda: (value,))
+def _kept(folder: Path, name: str, value: float) -> OnDisk[tuple[float]]:
+    kept = Cache.at(folder).stored("stage", (name,), lambda: (value,))
+    assert isinstance(kept, OnDisk)
+    return kept
 
 
 def test_what_was_kept_is_read_again(tmp_path: Path) -> None:
@@ -203,7 +205,7 @@ def test_without_a_place_for_temporary_files_everything_stays_in_memory(monkeypa
 
     monkeypatch.setattr("tempfile.gettempdir", nowhere)
     found = Cache.for_this_run().stored("stage", ("a",), lambda: 5)
-    assert found.file is None
+    assert isinstance(found, InMemory)
     assert found.load() == 5
 
 
@@ -312,5 +314,5 @@ def test_what_could_run_code_is_refused(value: Any) -> None:
 def test_an_entry_that_nobody_would_read_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rdstitch.system.cache._MAX_ENTRY", 1000)
     stored = Cache.at(tmp_path).stored("stage", (1,), lambda: np.zeros(1000))
-    assert stored.file is None
+    assert isinstance(stored, InMemory)
     assert len(stored.load()) == 1000

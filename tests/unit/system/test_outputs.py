@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,19 +25,19 @@ from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
 from rdstitch.system.cache import Cache
 from rdstitch.system.file_access import content_state, is_url, url_of
-from rdstitch.system.output_checks import check_output
+from rdstitch.system.output_checks import check_folder, check_output
 from rdstitch.system.outputs import Outputs, replace_folder, write_bytes_atomic
 from rdstitch.system.temporary_folder import TemporaryFolder
 from tests.faults import OPERATIONS, Operation, failing_disk
 
+_check = partial(check_folder, overwrite=True)
 _NAMES = ("a.dzi", "a.dzw", "a.dzi.json")
 
 
 def _write_all(folder: Path, content: bytes, overwrite: bool) -> None:
     with Outputs(overwrite) as outputs:
         with (
-            outputs.writing(folder / "a_files", is_folder=True) as tiles,
-            outputs.writing(folder / "a.dzi") as description,
+            outputs.writing_pair(folder / "a_files", folder / "a.dzi", _check) as (tiles, description),
         ):
             (tiles / "0").mkdir()
             for name in ("0_0.jpg", "1_0.jpg"):
@@ -94,7 +95,7 @@ def test_after_any_failure_every_file_is_whole(
 def test_a_file_that_appears_during_the_run_is_kept(tmp_path: Path, appearing: str) -> None:
     def write() -> None:
         with Outputs(overwrite=False) as outputs:
-            with outputs.writing(tmp_path / "a_files", is_folder=True) as tiles:
+            with outputs.writing_folder(tmp_path / "a_files", _check) as tiles:
                 (tiles / "0").mkdir()
             for name in _NAMES:
                 outputs.write(tmp_path / name, b"ours")
@@ -149,7 +150,7 @@ def test_a_folder_of_the_user_is_no_folder_of_tiles(tmp_path: Path) -> None:
 
     def write() -> None:
         with Outputs(overwrite=True) as outputs:
-            with outputs.writing(tmp_path / "photos_files", is_folder=True):
+            with outputs.writing_folder(tmp_path / "photos_files", _check):
                 pass
             outputs.write(tmp_path / "photos.dzi", b"new")
 
@@ -233,7 +234,7 @@ def test_nothing_is_renamed_in_which_a_file_is_open(tmp_path: Path, monkeypatch:
         monkeypatch.setattr(os, name, refusing(getattr(os, name)))
     for _ in range(2):
         with Outputs(overwrite=True) as outputs:
-            with outputs.writing(tmp_path / "x_files", is_folder=True) as folder:
+            with outputs.writing_folder(tmp_path / "x_files", _check) as folder:
                 (folder / "0").mkdir()
                 (folder / "0" / "0_0.jpg").write_bytes(b"tile")
             outputs.write(tmp_path / "x.dzi", b"description")
@@ -277,7 +278,7 @@ def test_what_a_caught_error_cut_short_is_not_published(tmp_path: Path) -> None:
 
 def test_several_folders_are_outputs_of_one_folder_also_after_one_that_was_dropped(tmp_path: Path) -> None:
     def write(outputs: Outputs, name: str, failing: bool = False) -> None:
-        with outputs.writing(tmp_path / name, is_folder=True) as folder:
+        with outputs.writing_folder(tmp_path / name, _check) as folder:
             (folder / name).write_text(name)
             if failing:
                 raise ValueError
@@ -345,6 +346,13 @@ def test_a_url_survives_as_a_path(url: str) -> None:
 @pytest.mark.parametrize("name", ["frame.jpg", "/tmp/a:/b.jpg", "C:/flight/a.jpg", "a::b/c.jpg"])
 def test_names_of_this_machine_are_no_urls(name: str) -> None:
     assert not is_url(name)
+
+
+def test_a_list_of_images_is_read_from_any_place(flight: str) -> None:
+    fsspec.filesystem("memory").pipe("/flight/list.txt", f"{flight}/f9.jpg\n{flight}/f2.tif\n".encode())
+    assert [str(frame.path) for frame in find_images([f"@{flight}/list.txt"]).frames] == [
+        str(Path(f"{flight}/{name}")) for name in ("f9.jpg", "f2.tif")
+    ]
 
 
 def test_folder_and_pattern(flight: str) -> None:

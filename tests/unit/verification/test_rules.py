@@ -21,7 +21,7 @@ from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
 from rdstitch.verification.self_similarity import Ambiguity
 from rdstitch.verification.verdict import _limit_warnings, _outvoted, failures_of_matches
-from tests.registrations import CAMERA, evidence, registration, source
+from tests.registrations import CAMERA, evidence, finding, registration, source
 
 FLAT = evidence(registration(), alike_fraction=0.8)
 
@@ -54,11 +54,11 @@ def test_of_what_is_not_flat_the_gravest_warns_where_it_matters(found: ResultEvi
 
 
 def test_there_are_a_few_lines_of_a_run_and_one_of_a_kind() -> None:
-    failures = Finding(Kind.ERRORS), Finding(Kind.IMAGE_MISFITS, (1,))
+    failures = finding(Kind.ERRORS), finding(Kind.IMAGE_MISFITS, (1,))
     assert _limit_warnings(failures) == failures
     kinds = [Kind.UNMASKED, Kind.UNMASKED, Kind.ZOOMED, Kind.TWO_OF_ONE_LENS, Kind.SETTLED_PATTERN]
-    limited = _limit_warnings(Finding(kind, (0,), "warning") for kind in kinds)
-    assert [finding.severity for finding in limited] == ["warning", "detail", "warning", "warning", "detail"]
+    limited = _limit_warnings(finding(kind, (0, 1), "warning") for kind in kinds)
+    assert [each.severity for each in limited] == ["warning", "detail", "warning", "warning", "detail"]
 
 
 def test_whoever_judges_keeps_to_the_table_of_rules() -> None:
@@ -107,7 +107,7 @@ def test_every_kind_has_a_sentence_that_its_rules_find_all_words_for() -> None:
     found = [
         (each, rules.findings((*rules.OF_MATCHES, *rules.OF_PAIRS, *rules.OF_THE_WHOLE), each)) for each in everything
     ]
-    found.append((FLAT, _outvoted([Finding(Kind.UNLIKE, (0, 1)), Finding(Kind.AMBIGUOUS, (1, 2))])))
+    found.append((FLAT, _outvoted([finding(Kind.UNLIKE, (0, 1)), finding(Kind.AMBIGUOUS, (1, 2))])))
     assert {finding.kind for _, findings in found for finding in findings} == set(Kind)
     texts = [message.text for each, findings in found for message in messages_of(findings, each.registration)]
     assert not any("{" in text for text in texts)
@@ -307,9 +307,9 @@ def test_errors_of_the_whole(rms: float, alike: float, relief: float | None, kin
     found = evidence(registration(rms=rms, relief=ground, cameras=cameras), alike_fraction=alike)
     findings = _found(found, Kind.ERRORS, Kind.ROUGH)
     assert [finding.kind for finding in findings] == ([] if kind is None else [kind])
-    for finding in findings:
-        assert finding.severity == ("warning" if kind == Kind.ROUGH else "failure")
-        assert finding.values == pytest.approx({"rms": rms, "threshold": 3.0}, nan_ok=True)
+    for each in findings:
+        assert each.severity == ("warning" if kind == Kind.ROUGH else "failure")
+        assert each.values == pytest.approx({"rms": rms, "threshold": 3.0}, nan_ok=True)
 
 
 def _checked(share: float, pair: tuple[int, int], *, unique: bool) -> CheckedLink:
@@ -327,5 +327,5 @@ def test_of_pairs_that_unique_places_decided_the_least_alike_is_named() -> None:
 def test_images_of_two_lenses_that_were_not_separated(certain: bool) -> None:
     mixed = TwoLenses(np.array([False, True, False]), (-0.1, -0.4), certain)
     findings = _found(evidence(registration(mixed=mixed)), Kind.LENSES_MIXED)
-    values = {"images2": [1], "images1": [0, 2], "lens2": -0.4, "lens1": -0.1}
+    values = {"images2": (1,), "images1": (0, 2), "lens2": -0.4, "lens1": -0.1}
     assert [finding.values for finding in findings] == ([] if certain else [values])

@@ -180,7 +180,7 @@ def test_few_images_of_a_pattern_are_held_at_once(monkeypatch: pytest.MonkeyPatc
     def unique() -> list[bool]:
         checked = overlap_check.check_overlaps(given, overlap_check.ComparedImages(given.sources, given.stretch))
         assert all(link.ambiguity.ambiguous for link in checked)
-        return [link.unique for link in checked]
+        return [link.decided_by_unique_content for link in checked]
 
     monkeypatch.setattr(overlap_check, "unique_shifts", counted)
     at_once = unique()

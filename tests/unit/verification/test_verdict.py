@@ -26,7 +26,7 @@ from rdstitch.verification.overlap_check import CheckedLink
 from rdstitch.verification.photometric_agreement import Agreement
 from rdstitch.verification.self_similarity import Ambiguity
 from tests.cli.running import flight
-from tests.registrations import evidence, registered, registration
+from tests.registrations import evidence, finding, registered, registration
 
 THRESHOLD = 3.0
 
@@ -182,10 +182,10 @@ def test_of_doubtful_pairs_on_which_nothing_depends_the_images_are_named() -> No
     def said(*findings: Finding) -> list[Message]:
         return messages_of(verdict._outvoted(findings), registration(4))
 
-    (message,) = said(Finding(Kind.UNLIKE, (2, 3)), Finding(Kind.PAIR_MISFITS, (0, 2)))
+    (message,) = said(finding(Kind.UNLIKE, (2, 3)), finding(Kind.PAIR_MISFITS, (0, 2)))
     assert message.images == ("folder/a.jpg", "folder/c.jpg", "folder/d.jpg")
     assert "2 pairs fit badly, and little depends on them: c.jpg and d.jpg, a.jpg and c.jpg" in message.text
-    badly, twice = said(Finding(Kind.UNLIKE, (2, 3)), Finding(Kind.AMBIGUOUS, (0, 2)))
+    badly, twice = said(finding(Kind.UNLIKE, (2, 3)), finding(Kind.AMBIGUOUS, (0, 2)))
     assert "one pair fits badly, and little depends on it: c.jpg and d.jpg" in badly.text
     assert "one pair fits as well elsewhere (a repeated pattern?)" in twice.text
     assert twice.images == ("folder/a.jpg", "folder/c.jpg")
