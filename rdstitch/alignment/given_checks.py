@@ -14,6 +14,7 @@ import numpy as np
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.alignment_options import AlignmentOptions
+from rdstitch.alignment.delays import at_delay, smooth
 from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.motion_models import MODELS, POSE, PSI, THETA
 from rdstitch.alignment.select import select_model
@@ -28,7 +29,7 @@ from rdstitch.alignment.starts import start_from
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.choices import ModelName
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.delays import DELAY_STD, DELAYS, at_delay, smooth
+from rdstitch.inputs.delays import DELAY_STD, DELAYS
 from rdstitch.results.messages import Message
 from rdstitch.robust.priors import WRONG_GIVEN_FOCAL
 

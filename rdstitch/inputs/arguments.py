@@ -1,4 +1,4 @@
-"""What each argument of the user stands for: an image, a folder, a pattern, a list, a URL, a video or a bag."""
+"""Arguments of the user, and what each stands for: an image, a folder, a pattern, a list, a URL, a video or a bag."""
 
 import glob
 import hashlib
@@ -24,11 +24,11 @@ _MAX_PATTERN = 4096  # characters: longer names no file has, and compiling a pat
 
 
 @dataclass(frozen=True)
-class NamedImage:
-    """An image among the arguments."""
+class ListedImage:
+    """An image that the arguments stand for."""
 
     frame: Frame
-    named: bool = True  # one by one, not by its folder or a pattern
+    explicit: bool = True  # named itself, not by its folder or a pattern
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Clip:
     path: Path
 
     def extract(self, folder: Path, every: int | None, topic: str | None) -> tuple[list[Frame], list[Message]]:
-        """Write the frames that are wanted to a folder; and what was passed over."""
+        """Write the frames that are wanted to a folder; with messages on those that were passed over."""
         # Of its own: another one may have the same name, in another folder.
         place = place_of(self.path)
         folder = folder / hashlib.sha256(os.fsencode(place)).hexdigest()[:8] / place.parent.name
@@ -52,7 +52,7 @@ class Clip:
         return [Frame(*frame) for frame in written], [*damages, *wanted.messages(self.path)]
 
     def unused_among(self, images: int) -> Message:
-        """Why it is not used beside images."""
+        """The message that it is not used beside images."""
         remedy = "give it alone, or --every N to use every N-th of its frames too"
         if images < 2:
             raise InputError(f"{self.path}: is a video beside one image; {remedy}")
@@ -61,16 +61,16 @@ class Clip:
 
 @dataclass(frozen=True)
 class Expanded:
-    """What arguments stand for, as :class:`FoundImages` has it, before videos are looked into."""
+    """Images and clips that arguments stand for, before videos are looked into."""
 
-    items: Sequence[NamedImage | Clip]
-    containers: Sequence[Path] = ()
+    items: Sequence[ListedImage | Clip]
+    containers: Sequence[Path] = ()  # the ``@list`` files, videos and bags that they come from
     notes: Sequence[Message] = ()
 
     @classmethod
     def several(cls, frames: Iterable[Path], notes: Sequence[Message] = ()) -> "Expanded":
         """Images that were not named one by one."""
-        return cls([NamedImage(Frame(path), named=False) for path in frames], (), notes)
+        return cls([ListedImage(Frame(path), explicit=False) for path in frames], (), notes)
 
 
 def expanded(arguments: Iterable[Named], lists: tuple[Path, ...] = ()) -> Expanded:
@@ -85,7 +85,7 @@ def expanded(arguments: Iterable[Named], lists: tuple[Path, ...] = ()) -> Expand
 
 def _named_by(argument: Named, lists: tuple[Path, ...]) -> Expanded:
     if isinstance(argument, Frame):
-        return Expanded([NamedImage(argument)])
+        return Expanded([ListedImage(argument)])
     path, text = Path(argument), os.fspath(argument)
     if not text:  # which a path takes for the current folder
         raise InputError("one of the names of images is empty; was a variable of the shell not set?")
@@ -99,21 +99,21 @@ def _named_by(argument: Named, lists: tuple[Path, ...]) -> Expanded:
             # Another program may write the list while we read it: @<(find ...) in a shell.
             inner = expanded(names_in(read_text(file, regular=False)), (*lists, file))
             return replace(inner, containers=[file, *inner.containers])
-        return Expanded.several(_matching(text)) if glob.has_magic(text) else Expanded([NamedImage(Frame(path))])
+        return Expanded.several(_matching(text)) if glob.has_magic(text) else Expanded([ListedImage(Frame(path))])
     if is_bag(path):
         return Expanded([Clip(path)], [*path.iterdir()] if path.is_dir() else [path])
     if path.is_dir():
         return Expanded.several(*_in_folder(path))
     if path.suffix.lower() in VIDEO_SUFFIXES:
         return Expanded([Clip(path)], [path])
-    return Expanded([NamedImage(Frame(path))])
+    return Expanded([ListedImage(Frame(path))])
 
 
 def _at_url(url: str) -> Expanded:
     """The image, or the images of the folder or pattern, that a URL names."""
     path, address = Path(url), without_query(Path(url))
     if not glob.has_magic(address.name) and address.suffix.lower() in READABLE_SUFFIXES:
-        return Expanded([NamedImage(Frame(path))])
+        return Expanded([ListedImage(Frame(path))])
     if address.suffix.lower() in VIDEO_SUFFIXES:
         raise InputError(f"{path}: only images are read from other machines; download the video first")
     try:
@@ -127,7 +127,7 @@ def _at_url(url: str) -> Expanded:
 
 
 def _exists(path: Path) -> bool:
-    """Whether there is a file; who reads it will say why one cannot be looked for."""
+    """Whether there is a file; the error of one that cannot be looked for comes when it is read."""
     try:
         return path.exists()
     except OSError:
@@ -166,7 +166,7 @@ def _has_images(folder: Path) -> bool:
 
 
 def _elsewhere(others: Sequence[Path]) -> str:
-    """Where the images may be, if a folder has none."""
+    """The end of a message: where the images may be, if a folder has none."""
     within = [str(path) for path in others if path.is_dir() and _has_images(path)]
     videos = [str(path) for path in others if path.suffix.lower() in VIDEO_SUFFIXES]
     if within:

@@ -40,7 +40,10 @@ def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list
     """
     if wanted is None:
         return list(sources)
-    return _of_images(sources) if wanted == XMP else _of_table(sources, wanted)
+    if wanted == XMP:
+        return _of_images(sources)
+    attitudes = _read_attitudes(wanted).of(sources)
+    return [replace(source, attitude=attitude) for source, attitude in zip(sources, attitudes, strict=True)]
 
 
 def _of_images(sources: Sequence[Source]) -> list[Source]:
@@ -66,56 +69,66 @@ def _of_images(sources: Sequence[Source]) -> list[Source]:
     return measured
 
 
-def _of_table(sources: Sequence[Source], file: str | Path) -> list[Source]:
-    """The sources with (ψ, θ), radians, of their lines, or of their times, and then at delays too."""
-    table, measured = _read_attitudes(file), []
-    rows = table.of(sources) if isinstance(table, RowsByImage) else [None] * len(sources)
-    for source, row in zip(sources, rows, strict=True):
-        turn = turning_matrix(source.metadata.orientation)
-        if not isinstance(table, RowsByImage):
-            tilts = [turned_tilt((psi, theta), turn) for psi, theta in table.at(source, file).tolist()]
-            attitude = MeasuredTilt(tilts[len(DELAYS) // 2], np.array(tilts))
-        elif row is None:
-            raise InputError(f"{file}: has no line for {source.name}; add one with its psi and theta")
-        else:
-            attitude = MeasuredTilt(turned_tilt(_tilt_of(row), turn))
-        measured.append(replace(source, attitude=attitude))
-    return measured
+@dataclass(frozen=True, eq=False)
+class _AttitudesByName:
+    """Attitudes by the names of images."""
+
+    file: str | Path
+    rows: RowsByImage
+
+    def of(self, sources: Sequence[Source]) -> list[MeasuredTilt]:
+        """Tilts of images, each of which the table must name."""
+        tilts = []
+        for source, row in zip(sources, self.rows.of(sources), strict=True):
+            if row is None:
+                raise InputError(f"{self.file}: has no line for {source.name}; add one with its psi and theta")
+            tilts.append(MeasuredTilt(turned_tilt(_tilt_of(row), turning_matrix(source.metadata.orientation))))
+        return tilts
 
 
 @dataclass(frozen=True, eq=False)
-class _TimedAttitudes:
+class _AttitudesByTime:
     """Attitudes by time, as an IMU measures them at its own rate."""
 
+    file: str | Path
     times: FloatArray  # (M,), s, ascending
     tilts: FloatArray  # (M, 2): (ψ, θ), radians
 
-    def at(self, source: Source, file: str | Path) -> FloatArray:
-        """(ψ, θ) (K, 2) of an image, whose time must lie within the table, at :data:`DELAYS` (K,), interpolated."""
-        time = float(timestamps_of([source])[0])
+    def of(self, sources: Sequence[Source]) -> list[MeasuredTilt]:
+        """Tilts of images, whose times must lie within the table, interpolated at :data:`DELAYS`."""
+        return [
+            self._of_one(source, time) for source, time in zip(sources, timestamps_of(sources).tolist(), strict=True)
+        ]
+
+    def _of_one(self, source: Source, time: float) -> MeasuredTilt:
         first, last = self.times[[0, -1]].tolist()
         beyond = float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
         if math.isnan(time):
-            raise InputError(f"{source.path}: has no time, and {file} has attitudes by time; give --timestamps")
+            raise InputError(f"{source.path}: has no time, and {self.file} has attitudes by time; give --timestamps")
         if not first - beyond <= time <= last + beyond:
             raise InputError(
-                f"{file}: has attitudes from {first:.3f} to {last:.3f} s, not for {source.name}, {time:.3f} s"
+                f"{self.file}: has attitudes from {first:.3f} to {last:.3f} s, not for {source.name}, {time:.3f} s"
             )
         if in_gap(self.times, np.array([time]))[0]:
-            raise InputError(f"{file}: has no attitudes for a long time before and after {source.name}, {time:.3f} s")
-        return np.stack([np.interp(time + DELAYS, self.times, values) for values in self.tilts.T], axis=1)
+            raise InputError(
+                f"{self.file}: has no attitudes for a long time before and after {source.name}, {time:.3f} s"
+            )
+        turn = turning_matrix(source.metadata.orientation)
+        rows = np.stack([np.interp(time + DELAYS, self.times, values) for values in self.tilts.T], axis=1)
+        tilts = [turned_tilt((psi, theta), turn) for psi, theta in rows.tolist()]
+        return MeasuredTilt(tilts[len(DELAYS) // 2], np.array(tilts))
 
 
 @cached_by_file_state
-def _read_attitudes(file: str | Path) -> RowsByImage | _TimedAttitudes:
+def _read_attitudes(file: str | Path) -> _AttitudesByName | _AttitudesByTime:
     wanted = ("name,psi,theta", "timestamp,psi,theta", "timestamp,qx,qy,qz,qw")
     rows = csv_rows(read_text(file), str(file), _COLUMNS, wanted, _UNITS)
     tilts = [_tilt_of(row) for row in rows]
     if any("name" in row.values for row in rows):
-        return RowsByImage(rows)
+        return _AttitudesByName(file, RowsByImage(rows))
     times = np.array([row.needed("timestamp") for row in rows])
     order = np.argsort(times, kind="stable")
-    return _TimedAttitudes(times[order], np.array(tilts).reshape(-1, 2)[order])
+    return _AttitudesByTime(file, times[order], np.array(tilts).reshape(-1, 2)[order])
 
 
 def _tilt_of(row: Row) -> tuple[float, float]:

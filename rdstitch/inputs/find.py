@@ -1,4 +1,4 @@
-"""What the user names as input: folders, files, patterns, lists, videos; in the end a list of frames."""
+"""The list of frames that the user names as input, by folders, files, patterns, lists and videos."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -8,7 +8,7 @@ from itertools import count
 from pathlib import Path
 
 from rdstitch.errors import InputError
-from rdstitch.inputs.arguments import NamedImage, expanded
+from rdstitch.inputs.arguments import ListedImage, expanded
 from rdstitch.inputs.frame import Frame, Named, files_of
 from rdstitch.inputs.image_folders import is_rdstitch_output, place_of
 from rdstitch.results.messages import Message, names_of, shortened
@@ -18,7 +18,7 @@ from rdstitch.system.temporary_folder import TemporaryFolder
 
 @dataclass(frozen=True)
 class FoundImages:
-    """What the user's arguments stand for."""
+    """Images that the user's arguments stand for."""
 
     frames: list[Frame]  # in natural order within a folder or pattern
     # images in folders and patterns that rdstitch wrote, by the sidecars beside them, and that are no input
@@ -28,12 +28,12 @@ class FoundImages:
 
     @property
     def files(self) -> list[Path]:
-        """What no output may be written over."""
+        """Files that no output may be written over."""
         return [*files_of(self.frames), *self.containers]
 
     @property
     def messages(self) -> list[Message]:
-        """What the user should know of what was not taken."""
+        """Messages on what was not taken."""
         if not self.outputs:
             return [*self.notes]
         paths = [str(path) for path in self.outputs]
@@ -90,24 +90,24 @@ def find_images(
     """
     excluded = {place_of(Path(path)) for path in exclude}
     named = expanded(arguments)
-    notes, stills = list(named.notes), [item for item in named.items if isinstance(item, NamedImage)]
+    notes, stills = list(named.notes), [item for item in named.items if isinstance(item, ListedImage)]
     frames: list[Frame] = []
     outputs: list[Path] = []
     for item in named.items:
-        if isinstance(item, NamedImage):
+        if isinstance(item, ListedImage):
             images = [item]
         elif every is None and stills:
             notes.append(item.unused_among(len(stills)))
             continue
         else:
             extracted, further = item.extract(frames_folder(), every, topic)
-            images, notes = [NamedImage(frame) for frame in extracted], [*notes, *further]
+            images, notes = [ListedImage(frame) for frame in extracted], [*notes, *further]
         for image in images:
             path = image.frame.path
             is_output = image.frame.image is None and not is_url(path) and is_rdstitch_output(path)
             if is_output and place_of(path) in excluded:
                 continue
-            if is_output and not image.named:
+            if is_output and not image.explicit:
                 outputs.append(path)
             else:
                 frames.append(image.frame)
@@ -117,7 +117,7 @@ def find_images(
 
 
 def _labelled(frames: Sequence[Frame]) -> list[Frame]:
-    """The same; those of one file name are called by as many of their folders too as tell them from each other."""
+    """The frames, those of one file name labelled by as many of their folders too as tell them from each other."""
     places: dict[str, set[tuple[str, ...]]] = {}
     located = [place_of(without_query(frame.path)) for frame in frames]
     for place in located:

@@ -40,12 +40,12 @@ class Frame:
 
     @property
     def name(self) -> str:
-        """What it is called in messages, tables and files, the same in every locale."""
+        """Its name in messages, tables and files, the same in every locale."""
         return self.label or canonical_name(without_query(self.path).name)
 
     @property
     def metadata(self) -> Metadata | None:
-        """What is known of it so far."""
+        """Header of its file as far as that was read, or of the image itself."""
         return self.header if self.image is None else self.image.metadata
 
     def decoded(self) -> DecodedImage:
@@ -69,7 +69,7 @@ Named = str | os.PathLike[str] | Frame
 
 
 def as_inputs(images: Images, channel_order: ChannelOrder = "bgr") -> list[Named]:
-    """What the user gave as a list: names stay as they are, arrays become frames.
+    """The list of what the user gave: names stay as they are, arrays become frames.
 
     A single path or array is one input. An array is of shape (H, W), (H, W, 1), (H, W, 3), or with alpha as the last
     channel (H, W, 2) or (H, W, 4), or of more bands, whose order stays; uint8, uint16 or floating point. An array of

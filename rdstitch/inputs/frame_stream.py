@@ -47,8 +47,9 @@ def open_frame_stream(
 ) -> FrameStream:
     """The frames of a folder, a video, a bag, a camera by its index, a stream, or of ``names``, one a line, for "-".
 
-    They end with a video or bag, with the list of names, and after ``idle`` seconds without a new one; those of a
-    folder or camera go on until they are interrupted otherwise. Streams are whatever else OpenCV opens
+    Every n-th frame is taken of videos, bags, cameras and streams; of folders and lists of names all are. They end with
+    a video or bag, with the list of names, and after ``idle`` seconds without a new one; those of a folder or camera go
+    on until they are interrupted otherwise. Streams are whatever else OpenCV opens
     ("rtsp://…", "/dev/video0"); what comes only once is kept in ``frames_folder``.
     """
     path, name, kept = Path(source), str(source), list[Named]()
@@ -72,7 +73,7 @@ def open_frame_stream(
 
 
 def _of_names(names: IO[str], idle: float | None, kept: list[Named]) -> Iterator[Frame]:
-    """The images whose names are read, by a thread that may wait for them."""
+    """Images whose names are read, by a thread that may wait for them."""
     read: queue.Queue[str | None] = queue.Queue(_MAX_PENDING)
     threading.Thread(target=_read_lines, args=(names, read), daemon=True).start()
     while True:

@@ -39,7 +39,7 @@ def natural_key(path: Path) -> tuple[list[tuple[int, str | int]], str]:
 
 
 def place_of(path: Path) -> Path:
-    """Where a name stands, links to folders followed but the last link not."""
+    """Path at which a name stands, with links to folders followed but the last link not."""
     # Path.resolve would stumble over links in a circle.
     return Path(os.path.realpath(path.parent)) / path.name
 

@@ -14,7 +14,7 @@ GuardState = tuple[dict[Path, ContentState | None], dict[Path, str]]
 
 
 class InputGuard:
-    """What is known of the input files of one run; shared by its sources, and by threads; if strict, damage is refused.
+    """Notes on the input files of one run, shared by its sources and by threads; if strict, damage is refused.
 
     A file is unchanged while its size, and the time of its last change, are.
     """
@@ -49,16 +49,16 @@ class InputGuard:
 
     @property
     def messages(self) -> list[Message]:
-        """What the user should know of the files."""
+        """Messages on damaged files."""
         return [Message(self.damaged[path], (str(path),), code="damaged") for path in sorted(self.damaged)]
 
     @property
     def warnings(self) -> list[Message]:
-        """The same, and what was left out as unreadable: what may be why a run failed."""
+        """Messages on damaged and unreadable files: these may be why a run failed."""
         return [*(left_out(path, self.unreadable[path]) for path in sorted(self.unreadable)), *self.messages]
 
     def state_of(self, paths: Iterable[Path]) -> GuardState:
-        """What was noticed of some files, for the guard of another process."""
+        """Notes on some files, for the guard of another process."""
         known = [path for path in paths if path in self._stamps]
         return (
             {path: self._stamps[path] for path in known},
@@ -66,7 +66,7 @@ class InputGuard:
         )
 
     def merge(self, notes: GuardState) -> None:
-        """Take over what a guard in another process has noticed, where files must have been the same."""
+        """Take over the notes of a guard in another process, where files must have been the same."""
         stamps, damaged = notes
         for path, stamp in stamps.items():
             self._note(path, stamp)

@@ -1,4 +1,4 @@
-"""Which frames of a video are worth stitching: those that show new ground.
+"""Keyframes of a video: the frames that show new ground, and are worth stitching.
 
 Neighbouring frames of a video share nearly everything. Frames are chosen so that those that follow one another share
 enough to be registered, and that each frame that is passed over lies, but for a small rest, within the two chosen
@@ -20,27 +20,28 @@ from rdstitch.features.corner_flow import CornerFlow, corners_of
 from rdstitch.features.prepared_image import PreparedImage
 from rdstitch.results.messages import Message
 
-_SHARED = (0.65, 0.8, 0.9)  # of two frames in a row, in the smaller direction; more where few frames would be left
+# All unmeasured but for tests of rendered videos.
+_SHARED = (0.65, 0.8, 0.9)  # fractions of two frames in a row, the smaller one; more where few frames would be left
 _ENOUGH = 12  # frames, from which on fewer shared matches do no harm to λ
-_UNSEEN = 0.03  # share of a frame that none of the chosen ones around it need show
+_UNSEEN = 0.03  # fraction of a frame that none of the chosen ones around it need show
 _SIDE = 320  # pixels of the longer side that frames are tracked at
 _MIN_CORNERS = 12  # corners that a motion is believed by
-_AGREEING = 0.4  # share of the corners that must agree
+_AGREEING = 0.4  # fraction of the corners that must agree
 _ERROR = 0.02  # of a motion, in sides: lenses and tilts are not affine
-_RENEWED_FROM = 0.5  # share of the corners, or of the side that they have come, after which new ones are taken
+_RENEWED_FROM = 0.5  # fraction of the corners, or of the side that they have come, after which new ones are taken
 _GRID = 16  # points a side by which areas are measured
 
 
 @dataclass(frozen=True, eq=False)
 class FramePlaces:
-    """Where the frames of a video lie."""
+    """Places of the frames of a video."""
 
     size: FloatArray  # (2,): of a frame, pixels of its small version
     places: FloatArray  # (N, 3, 3): from each frame to what all frames of its track have in common; affine
     track: NDArray[np.intp]  # (N,), intp: number of the track; one ends where a frame cannot be found again in the next
 
     def seen_by(self, frames: NDArray[np.intp], other: int) -> BoolArray:
-        """Which points of a grid in some frames another frame shows, (M, P)."""
+        """Mark the points of a grid in some frames that another frame shows, (M, P)."""
         axis = (np.arange(_GRID) + 0.5) / _GRID
         points = np.stack([*np.meshgrid(*(axis * side for side in self.size)), np.ones((_GRID, _GRID))]).reshape(3, -1)
         in_other = (np.linalg.inv(self.places[other]) @ self.places[frames] @ points)[:, :2]
@@ -48,7 +49,7 @@ class FramePlaces:
         return np.asarray(inside & (self.track[frames] == self.track[other])[:, None])
 
     def shared(self, first: int, second: int) -> float:
-        """Share of each of two frames that the other shows, whichever is smaller."""
+        """Fraction of each of two frames that the other shows, whichever is smaller."""
         pair = np.array([first, second])
         return float(min(self.seen_by(pair[1:], first).mean(), self.seen_by(pair[:1], second).mean()))
 
@@ -107,7 +108,7 @@ def _small(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class FrameSelection:
-    """Which frames of a video are wanted."""
+    """The frames of a video that are wanted."""
 
     every: int = 1  # every n-th one, unless they are chosen one by one
     chosen: frozenset[int] | None = None  # their numbers
@@ -118,7 +119,7 @@ class FrameSelection:
         return number % self.every == 0 if self.chosen is None else number in self.chosen
 
     def messages(self, path: Path) -> list[Message]:
-        """What the user should know of frames that were passed over for what they show."""
+        """Messages on frames that were passed over for what they show."""
         if self.chosen is None or len(self.chosen) == self.total:
             return []
         used = f"{len(self.chosen)} of {self.total} frames are used, the others show the same ground"
@@ -142,7 +143,10 @@ def wanted_frames(every: int | None, grey: Callable[[], Iterable[NDArray[np.uint
 
 
 def keyframes(places: FramePlaces) -> list[int]:
-    """Numbers of the frames of a video that are worth stitching, the first among them."""
+    """Numbers of the frames of a video that are worth stitching, the first among them.
+
+    By the least of :data:`_SHARED` that leaves enough of them; by the largest where none does.
+    """
     for shared in _SHARED:
         chosen = select_keyframes(places, shared)
         if len(chosen) >= _ENOUGH:

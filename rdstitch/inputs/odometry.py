@@ -22,7 +22,7 @@ _COLUMNS = {"timestamp": TIME_NAMES} | {
 _UNITS = {"timestamp": "s", "x": "m", "y": "m", "yaw": "rad", "yaw_deg": "deg"}
 _UNITS |= {"cov_x_x": "m m2 m²", "cov_y_y": "m m2 m²", "cov_yaw_deg_yaw_deg": "deg deg2 deg²"}
 _LISTED = 8  # numbers in TUM's lines
-_SLIP = 0.02  # share of distances and turns that wheels are off by if they do not say
+_SLIP = 0.02  # fraction of distances and turns that wheels are off by if they do not say
 
 
 class BodyPose(NamedTuple):
@@ -36,7 +36,7 @@ class BodyPose(NamedTuple):
 
 
 class BodyMotion(NamedTuple):
-    """How a body has moved, in its axes at the beginning."""
+    """Motion of a body, in its axes at the beginning."""
 
     moved: complex  # ahead, and to the left as the imaginary part
     turn: float  # radians, counterclockwise from above
@@ -110,7 +110,7 @@ def _listed_pose(where: str, line: str) -> tuple[float, ...]:
 
 
 def odometry_of(rows: Sequence[tuple[float, ...]], where: str) -> Odometry:
-    """From rows of time, x, y, yaw (radians), and the variances of a coordinate and of the yaw."""
+    """Odometry from rows of time, x, y, yaw (radians), and the variances of a coordinate and of the yaw."""
     # Of several at one time the last counts.
     values = np.array(sorted(rows, key=lambda row: row[0]), dtype=np.float64).reshape(-1, 6)
     values = values[np.append(np.diff(values[:, 0]) > 0.0, True)] if len(values) else values

@@ -1,4 +1,4 @@
-"""Where images were taken by EXIF, or by what a user has instead: a table, the output of exiftool, or a track.
+"""Positions of images by EXIF, or by what a user has instead: a table, the output of exiftool, or a track.
 
 ================================= ====================================================================
 CSV with a header                 a name, and latitude and longitude, or x and y; as ``exiftool -csv`` too
@@ -87,8 +87,9 @@ def with_positions(
 ) -> list[Source]:
     """The sources with the positions of a file, if there is one, instead of those of EXIF.
 
-    ``accuracy`` is the standard deviation of a horizontal coordinate, m, where they have none of their own; heights are
-    half as accurate.
+    ``epsg`` is the coordinate system of x and y where the file names none; ``offset``, s, is added to the times of the
+    images to find them on a track. ``accuracy`` is the standard deviation of a horizontal coordinate, m, where they
+    have none of their own; heights are half as accurate.
     """
     places = [source.metadata.gps for source in sources] if file is None else _places(sources, file, epsg, offset)
     for place in places if file is not None else ():
@@ -151,7 +152,7 @@ def _listed_fields(line: str) -> list[str]:
 
 
 def _by_rows(rows: Sequence[Row | None], file: str, system: NamedSystem | None) -> list[GpsPosition | None]:
-    """The positions that rows tell."""
+    """Positions by rows."""
     places: list[GpsPosition | None] = []
     coordinates = [None if row is None else coordinates_of(row) for row in rows]
     degrees = iter(geographic_places([each for each in coordinates if each is not None], file, system))
@@ -167,7 +168,7 @@ def _by_rows(rows: Sequence[Row | None], file: str, system: NamedSystem | None) 
 
 
 class Coordinates(NamedTuple):
-    """What a row says of a place."""
+    """Coordinates of a place, as a row has them."""
 
     where: str  # the file and the line, for messages
     x: float
@@ -176,7 +177,7 @@ class Coordinates(NamedTuple):
 
 
 def coordinates_of(row: Row) -> Coordinates | None:
-    """Those of a row; None where it has no position, or no fix."""
+    """Coordinates in a row; None where it has no position, or no fix."""
     geographic = not row.values.keys().isdisjoint(("latitude", "longitude"))
     y, x = (_degrees(row, *c) for c in _SIDES) if geographic else (row.number("y"), row.number("x"))
     return (

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rdstitch.errors import InputError, RdstitchError
-from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.odometry import Odometry, odometry_of, unit_quaternion, yaw_of
 from rdstitch.system.file_access import read_beginning
@@ -114,17 +113,6 @@ def odometry_in_bag(path: Path, topic: str) -> Odometry:
             yaw = yaw_of(unit_quaternion((turn.x, turn.y, turn.z, turn.w), f"{path}: {topic}"))
             rows.append((stamp or time_ns * 1e-9, at.x, at.y, yaw, (known[0] + known[7]) / 2.0, known[35]))
     return odometry_of(rows, f"{path}: {topic}")
-
-
-def camera_in(path: str | Path) -> Camera:
-    """The camera of a camera file, or of a bag that has its calibration."""
-    from rdstitch.camera_files import load_camera
-
-    if not is_bag(Path(path)):
-        return load_camera(path)
-    if (calibrated := camera_in_bag(Path(path))) is None:
-        raise InputError(f"{path}: the bag has no calibration in a topic of camera_info")
-    return calibrated[0].camera
 
 
 def chosen_topic(path: Path, reader: Any, wanted: str | None) -> str:

@@ -49,7 +49,7 @@ def extract_images(
 
 
 def images_in_bag(path: Path, folder: Path, every: int, topic: str | None = None) -> Iterator[Frame]:
-    """The same one after the other, every n-th one."""
+    """Write every n-th image of a topic to a folder, one after the other, as :func:`extract_images` does."""
     with opened_bag(path) as reader:
         yield from _Messages.of(reader, path, topic).frames(folder, FrameSelection(every))
 
@@ -80,7 +80,7 @@ class _Messages:
             yield None if pixels is None else _eight_bits(pixels)
 
     def frames(self, folder: Path, wanted: FrameSelection) -> Iterator[Frame]:
-        """Those that are wanted, written to a folder."""
+        """The wanted images, written to a folder."""
         for number, (connection, time_ns, data) in enumerate(self.reader.messages(connections=self.connections)):
             if number not in wanted:
                 continue
@@ -99,7 +99,7 @@ class _Messages:
 
 
 def _eight_bits(grey: NDArray[Any]) -> NDArray[np.uint8]:
-    """The same picture at any exposure: sensors of 10 or 12 bits leave the highest ones empty."""
+    """Grey of 8 bits, the same at any exposure: sensors of 10 or 12 bits leave the highest ones empty."""
     if grey.dtype == np.uint8:
         return grey
     brightest = max(1.0, float(np.quantile(grey[::4, ::4], _WHITE)))

@@ -1,4 +1,4 @@
-"""Which image each row of a table is about: the one whose path ends like the name in the row, in any case.
+"""Images by the names in rows of a table: the one whose path ends like the name, in any case.
 
 Files in two folders may have one name, as of drones, whose numbers begin anew in each folder. A row is about the image
 that has most of its name in common, from the file's name towards the first folder. Of images of one name, which are
@@ -27,7 +27,7 @@ class NamedFile(Protocol):
 
 
 class _Same(NamedTuple):
-    """How much two names have in common, in parts from the end; more is greater."""
+    """Length of what two names have in common, in parts from the end; more is greater."""
 
     folded: int  # in any case
     exactly: int

@@ -48,7 +48,7 @@ class Source:
     frame: Frame | None = field(default=None, compare=False, repr=False)
     # where it is kept between two stages that both look at it
     decoded_images: DecodedImageCache = field(
-        default_factory=partial(DecodedImageCache, room=0), compare=False, repr=False
+        default_factory=partial(DecodedImageCache, capacity=0), compare=False, repr=False
     )
     # what notices changes of the file, and damage
     guard: InputGuard = field(default_factory=InputGuard, compare=False, repr=False)
@@ -58,7 +58,7 @@ class Source:
 
     @property
     def name(self) -> str:
-        """What it is called in messages, reports and tables; see :class:`rdstitch.inputs.frame.Frame`."""
+        """Its name in messages, reports and tables; see :class:`rdstitch.inputs.frame.Frame`."""
         return self._frame.name
 
     @property

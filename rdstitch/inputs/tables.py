@@ -170,13 +170,13 @@ def json_rows(text: str, file: str, columns: Mapping[str, str], wanted: str) -> 
 
 
 def numbered_lines(text: str, file: str) -> list[tuple[str, str]]:
-    """Where each line is, for messages, and what it says, but for empty ones and those that begin with ``#``."""
+    """Lines with their places, for messages, but for empty ones and those that begin with ``#``."""
     lines = ((f"{file}: line {n}", line.strip()) for n, line in enumerate(text.splitlines(), start=1))
     return [(where, line) for where, line in lines if line and not line.startswith("#")]
 
 
 def numbers_before(fields: Sequence[str]) -> list[str]:
-    """Those of the fields before the first that is no number, nor an empty one."""
+    """Fields before the first that is no number, nor an empty one."""
     return list(takewhile(lambda field: _readings(field) or field.lower() in _EMPTY, fields))
 
 
@@ -213,7 +213,7 @@ def rows_of(
 
 
 def _readings(text: str) -> dict[str, float]:
-    """What a numeral is, by the decimal mark."""
+    """Numbers that a numeral may be, by the decimal mark."""
     numbers, text = {}, text.replace("\u2212", "-")  # as spreadsheets and web pages write minus
     for mark, notation in _NOTATIONS.items():
         if notation.fullmatch(text):
@@ -222,7 +222,7 @@ def _readings(text: str) -> dict[str, float]:
 
 
 def _column_finder(file: str, columns: Mapping[str, str], units: Mapping[str, str]) -> Callable[[str], str | None]:
-    """Which column a heading means."""
+    """Function that finds which column a heading means."""
     meaning = {alias: column for column, aliases in columns.items() for alias in aliases.split()}
 
     def plain(text: str) -> str:

@@ -1,12 +1,11 @@
-"""Where a table of measurements by time has nothing to interpolate between, as its device had stopped."""
+"""Gaps in a table of measurements by time, in which its device had stopped: there is nothing to interpolate between."""
 
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray
 
-_GAP = (
-    10.0  # in intervals that only a twentieth of a table exceeds: a logger that drops rows, or thins them, stays below
-)
+# Intervals that only a twentieth of a table exceeds: a logger that drops rows, or thins them, stays below.
+_GAP = 10.0
 
 
 def in_gap(times: FloatArray, at: FloatArray) -> BoolArray:

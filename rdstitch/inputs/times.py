@@ -1,8 +1,8 @@
-"""When images were taken: by a file, else by the video, the bag or EXIF."""
+"""Times at which images were taken: by a file, else by the video, the bag or EXIF."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,49 +38,72 @@ def with_times(frames: Sequence[Frame], file: str | Path | None) -> list[Frame]:
     """
     if file is None or not frames:
         return list(frames)
-    named = _read_times(file)
-    if not isinstance(named, list):
-        return [replace(frame, timestamp=time) for frame, time in zip(frames, _times(frames, named, file), strict=True)]
-    numbers = np.array(frame_numbers(frames))
-    if len(np.unique(numbers)) < len(numbers):  # of several videos
-        numbers = np.arange(len(frames))
-    steps = np.unique(np.diff(np.sort(numbers)))
-    # Of every n-th frame of a video up to n - 1 may follow the last; of chosen ones, and of one, any number.
-    of_video = frames[0].number is not None and frames[0].image is None
-    most = numbers.max() + steps[0] if len(steps) == 1 else math.inf if len(steps) or of_video else 1
-    if not numbers.max() < len(named) <= most:
-        last = f" or frames, the last with the number {numbers.max()} from 0" if most != len(frames) else ""
-        raise InputError(f"{file}: has {len(named)} times for {len(frames)} images{last}; give one for each, in order")
-    return [replace(frame, timestamp=named[number]) for frame, number in zip(frames, numbers.tolist(), strict=True)]
+    times = _read_times(file).of(frames)
+    return [replace(frame, timestamp=time) for frame, time in zip(frames, times, strict=True)]
 
 
 def time_of(frame: Frame, file: str | Path) -> float | None:
-    """The same of one frame, by its number or name; None where a file that grows as the frames do has no time yet."""
+    """Time of one frame by a file that may grow as the frames do; None where it has none yet."""
     try:
-        named = _read_times(file)
-        if isinstance(named, list):
-            return named[frame.number] if frame.number is not None and frame.number < len(named) else None
-        return _times([frame], named, file)[0]
+        return _read_times(file).of_one(frame)
     except InputError:
         return None
 
 
-def _times(frames: Sequence[Frame], named: RowsByImage, file: str | Path) -> list[float]:
-    times = []
-    for frame, row in zip(frames, named.of(frames), strict=True):
-        if row is None:
-            raise InputError(f"{file}: has no time for {frame.name}; add a line with its name and time")
-        times.append(row.needed("timestamp"))
-    return times
+@dataclass(frozen=True)
+class _TimesByNumber:
+    """Times in the order of the images, or of the frames of a video."""
+
+    file: str | Path
+    times: list[float]
+
+    def of(self, frames: Sequence[Frame]) -> list[float]:
+        """Times of all images, of which the file must have as many."""
+        numbers = np.array(frame_numbers(frames))
+        if len(np.unique(numbers)) < len(numbers):  # of several videos
+            numbers = np.arange(len(frames))
+        steps = np.unique(np.diff(np.sort(numbers)))
+        # Of every n-th frame of a video up to n - 1 may follow the last; of chosen ones, and of one, any number.
+        of_video = frames[0].number is not None and frames[0].image is None
+        most = numbers.max() + steps[0] if len(steps) == 1 else math.inf if len(steps) or of_video else 1
+        if not numbers.max() < len(self.times) <= most:
+            last = f" or frames, the last with the number {numbers.max()} from 0" if most != len(frames) else ""
+            counted = f"{len(self.times)} times for {len(frames)} images{last}"
+            raise InputError(f"{self.file}: has {counted}; give one for each, in order")
+        return [self.times[number] for number in numbers.tolist()]
+
+    def of_one(self, frame: Frame) -> float | None:
+        """Time of a frame by its number."""
+        return self.times[frame.number] if frame.number is not None and frame.number < len(self.times) else None
+
+
+@dataclass(frozen=True)
+class _TimesByName:
+    """Times by the names of images."""
+
+    file: str | Path
+    rows: RowsByImage
+
+    def of(self, frames: Sequence[Frame]) -> list[float]:
+        """Times of images, each of which the file must name."""
+        times = []
+        for frame, row in zip(frames, self.rows.of(frames), strict=True):
+            if row is None:
+                raise InputError(f"{self.file}: has no time for {frame.name}; add a line with its name and time")
+            times.append(row.needed("timestamp"))
+        return times
+
+    def of_one(self, frame: Frame) -> float | None:
+        """Time of a frame by its name."""
+        return self.of([frame])[0]
 
 
 @cached_by_file_state
-def _read_times(file: str | Path) -> list[float] | RowsByImage:
-    """The times in order, or by the names of images."""
+def _read_times(file: str | Path) -> _TimesByNumber | _TimesByName:
     text = read_text(file)
     lines = numbered_lines(text, str(file))
     if lines and all(is_number(line) for _, line in lines):
-        return [float(line) for _, line in lines]
+        return _TimesByNumber(file, [float(line) for _, line in lines])
     if not lines or not is_number(lines[0][1].split()[0]):
         rows = csv_rows(text, str(file), _COLUMNS, ("name,timestamp",), {"timestamp": "s"})
     else:
@@ -91,4 +114,4 @@ def _read_times(file: str | Path) -> list[float] | RowsByImage:
                 wanted = f"a table with the columns {','.join(_COLUMNS)}, lines TIMESTAMP NAME, or one time a line"
                 raise InputError(f"{where}: found '{line}'; give {wanted}")
             rows.append(Row(where, {"name": name, "timestamp": time}, "."))
-    return RowsByImage(rows)
+    return _TimesByName(file, RowsByImage(rows))

@@ -1,10 +1,11 @@
-"""Where images were taken by what moved the camera: a GPX track, a video's subtitles, a receiver's list of events."""
+"""Positions of images by what moved the camera: a GPX track, a video's subtitles, a receiver's list of events."""
 
 import math
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -53,8 +54,17 @@ def by_events(sources: Sequence[Source], text: str, file: str) -> list[GpsPositi
     return places
 
 
-def subtitle_points(text: str) -> list[tuple[float, float, float, float]]:
-    """Seconds since the video began, latitude, longitude and altitude in the subtitles of a DJI video."""
+class TrackPoint(NamedTuple):
+    """A place by time, of the camera or of what carries it."""
+
+    seconds: float  # since 1970, or since the video began: as the times of the images
+    latitude: float  # latitude, longitude: degrees
+    longitude: float
+    altitude: float  # m; NaN where not known
+
+
+def subtitle_points(text: str) -> list[TrackPoint]:
+    """Places in the subtitles of a DJI video, by seconds since it began."""
     starts = list(_SUBTITLE.finditer(text))
     points = []
     for start, end in zip(starts, [*(s.start() for s in starts[1:]), len(text)], strict=False):
@@ -63,12 +73,12 @@ def subtitle_points(text: str) -> list[tuple[float, float, float, float]]:
             latitude, longitude = (float(place[k] or place[f"{k}2"]) for k in ("lat", "lon"))
             if latitude or longitude:  # 0, 0 is what is written without a fix
                 time = 3600.0 * hours + 60.0 * minutes + seconds + milliseconds / 1000.0
-                points.append((time, latitude, longitude, float(place["alt"] or "nan")))
+                points.append(TrackPoint(time, latitude, longitude, float(place["alt"] or "nan")))
     return points
 
 
-def track_points(text: str, file: str) -> list[tuple[float, float, float, float]]:
-    """Seconds since 1970, latitude, longitude and altitude of a GPX track, else of a route, else of waypoints."""
+def track_points(text: str, file: str) -> list[TrackPoint]:
+    """Places of a GPX track, else of a route, else of waypoints, by seconds since 1970."""
     timed = [item for item in parse_xml(text, file).iter() if item.findtext("time") is not None]
     by_kind = ([item for item in timed if item.tag == kind] for kind in ("trkpt", "rtept", "wpt"))
     points = []
@@ -79,14 +89,18 @@ def track_points(text: str, file: str) -> list[tuple[float, float, float, float]
             values = (float(item.get("lat", "")), float(item.get("lon", "")), float(item.findtext("ele") or "nan"))
         except ValueError as error:
             raise InputError(f"{file}: a point of the track at {time!r} cannot be read: {error}") from error
-        points.append(((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp(), *values))
+        seconds = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+        points.append(TrackPoint(seconds, *values))
     return points
 
 
 def on_track(
-    sources: Sequence[Source], points: Sequence[tuple[float, float, float, float]], file: str, offset: float
+    sources: Sequence[Source], points: Sequence[TrackPoint], file: str, offset: float
 ) -> list[GpsPosition | None]:
-    """Where the images are on a track, straight from point to point; None beyond its ends, and in its gaps."""
+    """Positions of the images on a track, straight from point to point; None beyond its ends, and in its gaps.
+
+    ``offset``, s, is added to the times of the images.
+    """
     if not points:
         raise InputError(f"{file}: has no points with a time; give a GPX track or the subtitles (.SRT) of the video")
     seconds, latitude, longitude, altitude = np.array(sorted(points)).T

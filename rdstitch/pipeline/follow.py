@@ -22,8 +22,9 @@ from rdstitch.inputs.attitudes import XMP, with_attitudes
 from rdstitch.inputs.delays import MeasuredTilt
 from rdstitch.inputs.frame import Frame, Image, as_inputs
 from rdstitch.inputs.input_guard import InputGuard
+from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.odometry import BodyPose, Odometry, as_odometry
-from rdstitch.inputs.selection import is_selected, with_masks
+from rdstitch.inputs.selection import is_selected
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import time_of, timestamps_of
 from rdstitch.io.opening import check_readable

@@ -10,7 +10,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import inverse, turned_size
 from rdstitch.inputs.find import find_images
 from rdstitch.inputs.frame import Named
-from rdstitch.inputs.rosbag import camera_in, camera_in_bag, is_bag, only_bag
+from rdstitch.inputs.rosbag import camera_in_bag, is_bag, only_bag
 from rdstitch.io.metadata import read_metadata
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message
@@ -19,7 +19,9 @@ from rdstitch.results.messages import Message
 def read_camera(file: str | Path, inputs: Sequence[Named] = ()) -> tuple[Camera, list[Message]]:
     """The camera of a file, without a size that of ``inputs``, or bag; where λ is fitted to another model, how well."""
     if is_bag(Path(file)):
-        return camera_in(file), []
+        if (calibrated := camera_in_bag(Path(file))) is None:
+            raise InputError(f"{file}: the bag has no calibration in a topic of camera_info")
+        return calibrated[0].camera, []
     from rdstitch.camera_files import read_camera_file  # with all formats, which most runs have no use for
 
     read = read_camera_file(file, partial(_stored_size, file, inputs))

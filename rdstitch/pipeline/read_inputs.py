@@ -8,8 +8,9 @@ from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.ground_control import with_ground_control
 from rdstitch.inputs.image_folders import natural_key
 from rdstitch.inputs.input_guard import InputGuard
+from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.positions import with_positions
-from rdstitch.inputs.selection import selected, with_masks
+from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.matching.candidate_pairs import EXHAUSTIVE_UP_TO
 from rdstitch.options.stitch_options import StitchOptions

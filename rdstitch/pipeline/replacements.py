@@ -7,7 +7,7 @@ from rdstitch.errors import InputError, PartialResultError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.input_guard import InputGuard
-from rdstitch.inputs.selection import with_masks
+from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.pipeline.flat_field import check_one_size, with_flat_field

@@ -1,4 +1,4 @@
-"""Whether keyframes agree with what is given of the camera: focal length, tilt, and the times of attitudes."""
+"""Check of what is given of the camera by keyframes: its focal length, its tilt, and the times of attitudes."""
 
 import math
 from dataclasses import dataclass, replace
@@ -20,9 +20,9 @@ _SURER = 0.5  # of the standard deviation of all lengths that earlier frames wer
 
 @dataclass(frozen=True)
 class CameraCheck:
-    """What the keyframes of a map show of a camera whose lens and focal length are given."""
+    """Judgement on a camera whose lens and focal length are given, by the keyframes of a map."""
 
-    knowledge: CameraKnowledge  # with that
+    knowledge: CameraKnowledge  # with what they show
     messages: list[Message]
     length_factor: float | None = None  # by which lengths change, as keyframes are placed anew; None: they stay
     focal_replaced: bool = False  # whether motions contradict the focal length, and with it alignments under way
@@ -42,7 +42,7 @@ def check_given_camera(keyframe_map: KeyframeMap, latest: IncomingFrame) -> Came
         return None
     if not keyframe_map.links or (has_plane and added not in _CHECKS and added % _INTERVAL):
         return None
-    return _judged(knowledge, focal, latest, _estimate(keyframe_map, focal.value), has_plane=has_plane)
+    return judge_camera(knowledge, latest, _estimate(keyframe_map, focal.value), has_plane=has_plane)
 
 
 def _estimate(keyframe_map: KeyframeMap, focal: float) -> CameraEstimate:
@@ -58,11 +58,12 @@ def _estimate(keyframe_map: KeyframeMap, focal: float) -> CameraEstimate:
     return camera_from_motion(SeenPairs.of(rays, measured if len(measured) == len(rays) else []), tilt)
 
 
-def _judged(
-    knowledge: CameraKnowledge, before: FocalLength, latest: IncomingFrame, estimate: CameraEstimate, *, has_plane: bool
+def judge_camera(
+    knowledge: CameraKnowledge, latest: IncomingFrame, estimate: CameraEstimate, *, has_plane: bool
 ) -> CameraCheck:
-    """Judge what is known, with the focal length ``before``, by an estimate from motions."""
-    delay, scale, messages = knowledge.delay, latest.camera.scale, list[Message]()
+    """Judge what is known of a given camera, with the latest frame's, by an estimate from motions."""
+    before, delay, scale, messages = knowledge.focal, knowledge.delay, latest.camera.scale, list[Message]()
+    assert before is not None
     if latest.attitude is not None:
         delay = Estimate(estimate.delay, estimate.delay_std)
         if abs(delay.value) > LATE * delay.std:
@@ -77,7 +78,7 @@ def _judged(
         length_factor = math.exp(-estimate.log_focal)
         return CameraCheck(replace(knowledge, plane=plane), messages, length_factor, focal_replaced=True)
     if not has_plane:
-        if max(estimate.tilt_std, estimate.rms) * focal.value * scale >= MATCH_ERROR:
+        if not max(estimate.tilt_std, estimate.rms) * focal.value * scale < MATCH_ERROR:
             return CameraCheck(knowledge, messages)
         plane = MetricPlane(focal.value, estimate.tilt_given_focal, True, estimate.tilt_std)
         return CameraCheck(replace(knowledge, plane=plane), messages, 1.0)
@@ -86,7 +87,7 @@ def _judged(
     if moved:
         return CameraCheck(knowledge, messages, 1.0)
     std, reported = focal.log_std, focal.reported_std
-    if std is None or reported is None or std >= _SURER * reported:
+    if std is None or reported is None or not std < _SURER * reported:
         return CameraCheck(knowledge, messages)
     return CameraCheck(replace(knowledge, focal=replace(focal, reported_std=std)), messages, surer=True)
 

@@ -1,4 +1,4 @@
-"""What a tracker knows of its camera so far: the lens, the focal length, the tilt, and how late attitudes are."""
+"""Knowledge of a tracker about its camera so far: the lens, the focal length, the tilt, and how late attitudes are."""
 
 import math
 from collections.abc import Sequence
@@ -9,13 +9,14 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from rdstitch.alignment import Alignment, AlignmentOptions
+from rdstitch.alignment.delays import at_delay, change_with_delay
 from rdstitch.alignment.given_checks import judged_focal
 from rdstitch.alignment.motion_models import LOG_HEIGHT, MODELS, MotionModel
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import ModelName
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.delays import DELAY_STD, at_delay, change_with_delay
+from rdstitch.inputs.delays import DELAY_STD
 from rdstitch.matching.distortion_consensus import vote
 from rdstitch.matching.links import Link
 from rdstitch.robust import EstimationOptions
@@ -45,7 +46,7 @@ class ShapeStd(NamedTuple):
 
 
 class FocalOrigin(Enum):
-    """What the focal length of a map is by."""
+    """Origin of the focal length of a map."""
 
     GIVEN = auto()  # the user, whom images do not contradict
     MOTION = auto()  # the motions between keyframes, which contradict the user
@@ -64,7 +65,7 @@ class FocalLength:
 
 @dataclass(frozen=True)
 class CameraKnowledge:
-    """What is known of the camera whose frames are tracked; what is learned gives the next one."""
+    """Knowledge about the camera whose frames are tracked; each step that adds to it gives the next one."""
 
     given: AlignmentOptions
     pair: EstimationOptions  # with λ, once it is known
@@ -239,7 +240,7 @@ def _aligned_focal(alignment: Alignment) -> FocalLength | None:
 
 
 def _shape_std(alignment: Alignment) -> ShapeStd | None:
-    """How uncertain the shape of an aligned path is; None where the alignment does not say, or goes nowhere."""
+    """Uncertainty of the shape of an aligned path; None where the alignment does not say, or goes nowhere."""
     if alignment.poses is None or alignment.poses.covariance is None:
         return None
     path = Trajectory.from_poses(alignment.poses)

@@ -11,12 +11,13 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.tracking.placement import HEIGHT, YAW, Placement, PlaneSimilarity, X, Y
 
-_CELLS = 8  # a side of an image: errors of one cell share a part that comes of the lens and the pixels of a place
+# A side of an image: errors of one cell share a part that comes of the lens and the pixels of a place; 4, 16: the same.
+_CELLS = 8
 
 
 @dataclass(frozen=True)
 class MetricPlane:
-    """What a motion in the plane needs of the camera."""
+    """Focal length and tilt of a camera that moves over a plane."""
 
     focal: float  # half diagonals
     tilt: tuple[float, float]  # (ψ, θ), radians, of all frames, or of the mount of what measures attitudes

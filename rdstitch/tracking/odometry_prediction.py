@@ -15,7 +15,7 @@ _KEYFRAMES = 60  # the last ones, by which it is found how the camera is mounted
 
 @dataclass
 class OdometryPrediction:
-    """How the camera is mounted on the body, and the frame from which the wheels go on."""
+    """Mounting of the camera on the body, and the frame from which the wheels go on."""
 
     mounted: OdometryFit | None = None  # in units of the map
     latest: TrackedFrame | None = None  # of those that had a place and odometry

@@ -68,7 +68,7 @@ class PlaneSimilarity:
 
     @classmethod
     def fitted(cls, before: FloatArray, after: FloatArray, *, keep_size: bool = False) -> Self:
-        """The one that brings points (N, 2) nearest to others (N, 2), in the sense of least squares."""
+        """The similarity that brings points (N, 2) nearest to others (N, 2), in the sense of least squares."""
         start, end = (points @ np.array([1.0, 1.0j]) for points in (before, after))
         middle, goal = complex(start.mean()), complex(end.mean())
         turn = complex(np.vdot(start - middle, end - goal)) / max(
@@ -80,13 +80,13 @@ class PlaneSimilarity:
 
     @classmethod
     def to_origin(cls, pose: CameraPose) -> Self:
-        """The one that brings a camera to the origin, with yaw zero and height one."""
+        """The similarity that brings a camera to the origin, with yaw zero and height one."""
         turn = complex(math.cos(pose.yaw), math.sin(pose.yaw)) / pose.height
         return cls(turn, -turn * complex(pose.x, pose.y))
 
     @classmethod
     def between(cls, before: Sequence[Placement], after: Sequence[Placement]) -> Self:
-        """The one that brings the plane of some placements to that of other placements of the same images."""
+        """The similarity that brings the plane of some placements to that of others of the same images."""
         source, target = (
             np.concatenate([placed.to_plane(placed.camera.outline(_SAMPLES)) for placed in side])
             for side in (before, after)
@@ -96,10 +96,10 @@ class PlaneSimilarity:
 
     @property
     def matrix(self) -> FloatArray:
-        """As a homography (3, 3)."""
+        """The similarity as a homography (3, 3)."""
         a, b = self.turn, self.shift
         return np.array([[a.real, -a.imag, b.real], [a.imag, a.real, b.imag], [0.0, 0.0, 1.0]])
 
     def applied(self, placed: Placement) -> Placement:
-        """The same image after the plane was moved."""
+        """Place an image where it lies after the plane was moved."""
         return Placement(placed.camera, self.matrix @ placed.homography, placed.focal)

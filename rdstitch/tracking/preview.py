@@ -62,7 +62,7 @@ class Preview:
         self._part(low, high)[shown] = colours[shown]
 
     def _part(self, low: NDArray[np.intp], high: NDArray[np.intp]) -> NDArray[np.uint8]:
-        """What is painted between two corners, pixels from the plane's origin; a view."""
+        """Painted pixels between two corners, pixels from the plane's origin; a view."""
         (left, top), (right, bottom) = low - self._origin, high - self._origin
         return self.pixels[top:bottom, left:right]
 

@@ -1,4 +1,4 @@
-"""A frame while it is tracked, and what is known of it afterwards."""
+"""A frame while it is tracked, and its result."""
 
 import math
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.features import Features
 from rdstitch.features.corner_flow import corners_of, is_static
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
@@ -63,26 +63,21 @@ class IncomingFrame:
     camera: Camera
     image: PreparedImage
     detect: Callable[[PreparedImage], Features]
+    static_places: BoolArray  # (P, P): cells of the image that do not move with the floor
     attitude: FloatArray | None = None  # (S, 2): (ψ, θ) as measured at DELAYS, radians
     body: BodyPose | None = None  # by odometry
-    static_places: BoolArray | None = None  # (P, P): cells of the image that do not move with the floor
 
     @cached_property
     def corners(self) -> FloatArray:
         """Corners (N, 2), by which it is matched where its place is about known."""
         corners = corners_of(self.image)
-        return corners[self._on_floor(corners)]
+        return corners[~is_static(corners, self.image, self.static_places)]
 
     @cached_property
     def features(self) -> Features:
         """Features, by which it is matched where its place is not known."""
         features = self.detect(self.image)
-        return features.take(self._on_floor(features.points))
-
-    def _on_floor(self, points: FloatArray) -> IntArray:
-        """Indices of the points (N, 2) that may move with the floor."""
-        places = self.static_places
-        return np.arange(len(points)) if places is None else np.flatnonzero(~is_static(points, self.image, places))
+        return features.take(np.flatnonzero(~is_static(features.points, self.image, self.static_places)))
 
     @property
     def textured(self) -> bool:
@@ -127,7 +122,7 @@ class TrackedFrame:
         return self.frame.number
 
     def points_in(self, other: "TrackedFrame", points: FloatArray) -> FloatArray:
-        """Where another frame shows points (N, 2) of this one, by the places of both."""
+        """Points (N, 2) of this frame as another one shows them, by the places of both."""
         there = other.placement
         return from_plane(there.camera, there.homography, self.placement.to_plane(points))
 

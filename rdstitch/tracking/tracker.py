@@ -29,11 +29,9 @@ from rdstitch.tracking.tracked_frame import IncomingFrame, TrackedFrame, Trackin
 from rdstitch.tracking.tracking_state import TrackingState
 
 _PATIENCE = 0.015  # seconds a frame that are waited for the first alignment
-_KEYFRAME_OVERLAP = 0.8  # fraction of a frame that its last keyframe shows, below which it becomes a keyframe
-
-
-Followed = tuple[FloatArray, FloatArray] | None
-"""Corners (N, 2) of the last keyframe, before and now; None where too few could be followed."""
+# Fraction of a frame that its last keyframe shows, below which it becomes a keyframe; 0.7: 3.6 mm, and lengths are
+# known to 1.9 % instead of 0.4; 0.9: 3.1 mm, and 1.4 times the time.
+_KEYFRAME_OVERLAP = 0.8
 
 
 class FrameTracker:
@@ -75,7 +73,7 @@ class FrameTracker:
         :data:`rdstitch.inputs.delays.DELAYS`; ``body`` is by odometry.
         """
         followed = self._flow.follow(image)
-        frame = IncomingFrame(self._count, camera, image, self._detect, attitude, body, self._flow.static_places)
+        frame = IncomingFrame(self._count, camera, image, self._detect, self._flow.static_places, attitude, body)
         self._count += 1
         if not self._map.keyframes:
             return [self._first(frame, 0)]
@@ -92,9 +90,9 @@ class FrameTracker:
             results += self._take_over(None, None)
         return list({result.number: result for result in results}.values())
 
-    def _registered(self, frame: IncomingFrame, followed: Followed) -> list[TrackingResult]:
-        """Place a frame by the corners that were followed, else by links with keyframes, else by odometry."""
-        placed, links = self._place_followed(frame, followed), list[Link]()
+    def _registered(self, frame: IncomingFrame, followed: tuple[FloatArray, FloatArray] | None) -> list[TrackingResult]:
+        """Place a frame by the corners (N, 2) that were followed, else by links with keyframes, else by odometry."""
+        placed, links = None if followed is None else self._place_followed(frame, *followed), list[Link]()
         if placed is None or self._is_new(placed):
             links = self._map.links_with(frame, placed, self._match)
             placed = self._map.place_by_links(frame, links) or placed
@@ -142,10 +140,10 @@ class FrameTracker:
             results += [] if between else self._add_keyframe(placed, links)
         return [*results, self._result(placed, inliers)]
 
-    def _place_followed(self, frame: IncomingFrame, followed: Followed) -> TrackedFrame | None:
-        """Place a frame by the corners of the last keyframe; None where too few of them agree on a place."""
+    def _place_followed(self, frame: IncomingFrame, before: FloatArray, now: FloatArray) -> TrackedFrame | None:
+        """Place a frame by corners (N, 2) of the last keyframe; None where too few of them agree on a place."""
         last = self._map.keyframes[-1]
-        placed = None if followed is None else self._map.place(frame, last, *followed, rough=True)
+        placed = self._map.place(frame, last, before, now, rough=True)
         if placed is None or not agree(placed.inliers):
             return None
         # Where the view turns, what is followed from frame to frame drifts.

@@ -1,4 +1,4 @@
-"""What becomes of a frame that is tracked, and the words by which users read why it has no place."""
+"""States of a frame that is tracked, and the words by which users read why it has no place."""
 
 from enum import Enum
 

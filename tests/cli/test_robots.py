@@ -20,7 +20,7 @@ from examples.worlds.paths import drive_poses
 from rdstitch.camera_files import load_camera
 from rdstitch.camera_files.lens_models import RATIONAL, nearest_model
 from rdstitch.geometry.camera import Camera
-from rdstitch.inputs.rosbag import camera_in
+from rdstitch.inputs.rosbag import camera_in_bag
 from rdstitch.io import read_image
 from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, rows_of, start
@@ -193,7 +193,7 @@ def test_which_images_of_a_bag_are_rectified_and_which_part_they_show(
     topic: str, kind: str, rectified: bool, margin: int, frames: list[Path], tmp_path: Path
 ) -> None:
     bag = _write_bag(tmp_path, frames[:1], 2, kind, 380.0, "/cam/camera_info", topic, margin)
-    camera = camera_in(bag)
+    camera = camera_in_bag(bag)[0].camera
     assert camera.image_size == (400, 300)
     assert camera.center == pytest.approx((199.5, 149.5), abs=0.01)
     assert camera.focal == pytest.approx(380.0)

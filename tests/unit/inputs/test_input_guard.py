@@ -181,7 +181,7 @@ def test_masks_are_kept_apart(source: Source, tmp_path: Path) -> None:
 
 
 def test_images_for_which_there_is_no_room_are_not_kept() -> None:
-    decoded_images = DecodedImageCache(room=250)
+    decoded_images = DecodedImageCache(capacity=250)
     large, small = (DecodedImage(np.zeros((10, n), np.uint8), None, Metadata((n, 10))) for n in (20, 5))
     decoded_images.put("large", large)
     decoded_images.put("other", large)

@@ -18,7 +18,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import SIDEWAYS, turned, turned_size
 from rdstitch.inputs.find import find_images
 from rdstitch.inputs.input_guard import InputGuard
-from rdstitch.inputs.selection import with_masks
+from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import DecodedImage, read_image
 from rdstitch.io.mask import Mask, mask_frame, read_mask

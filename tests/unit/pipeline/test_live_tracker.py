@@ -255,7 +255,7 @@ def test_masks_lie_in_folders_as_their_frames_do(tmp_path: Path, monkeypatch: py
             cv2.imwrite(str(tmp_path / kind / folder / "f.png"), np.full((30, 40), 255, np.uint8))
     tracker = rdstitch.Tracker(rdstitch.StitchOptions(mask=tmp_path / "masks"))
     listed = Mock(side_effect=os.walk)
-    monkeypatch.setattr("rdstitch.inputs.selection.os.walk", listed)
+    monkeypatch.setattr("rdstitch.inputs.masks.os.walk", listed)
     source, _, _ = tracker.read(Frame(tmp_path / "frames" / "east" / "f.png", label="east/f.png"))
     assert source is not None
     assert source.mask is not None

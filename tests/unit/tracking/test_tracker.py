@@ -33,7 +33,8 @@ from rdstitch.tracking import (
     Preview,
     TrackingResult,
 )
-from rdstitch.tracking.camera_check import check_given_camera
+from rdstitch.tracking.camera_check import check_given_camera, judge_camera
+from rdstitch.tracking.camera_from_motion import CameraEstimate
 from rdstitch.tracking.camera_knowledge import CameraKnowledge, FocalLength, FocalOrigin
 from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.map_refinement import MapRefinement
@@ -320,7 +321,8 @@ def _keyframe(number: int, placement: Placement | None = None) -> TrackedFrame:
     """Of a camera with a given focal length, on a body that moves ahead."""
     camera = Camera((640, 480), -0.2, focal=1.3 * 400.0, focal_source="option")
     image = prepare(View(np.zeros((480, 640), dtype=np.uint8)), None)
-    frame = IncomingFrame(number, camera, image, MADE_UP.__getitem__, body=BodyPose(0.5 * number, 0.0, 0.0))
+    static, body = CornerFlow().static_places, BodyPose(0.5 * number, 0.0, 0.0)
+    frame = IncomingFrame(number, camera, image, MADE_UP.__getitem__, static, body=body)
     return TrackedFrame(frame, placement or _placed(number, 0.0, 0.0, 1.0), True, np.zeros((4, 4)), keyframe=True)
 
 
@@ -347,6 +349,24 @@ def test_keyframes_by_odometry_are_no_measurement_of_it() -> None:
 def test_keyframes_without_links_show_nothing_of_the_camera() -> None:
     keyframe_map = KeyframeMap(_given_camera(), [_keyframe(23), _keyframe(24)], has_plane=True, added=24)
     assert check_given_camera(keyframe_map, keyframe_map.keyframes[-1].frame) is None
+
+
+def test_a_given_camera_is_confirmed_or_replaced_or_gets_its_plane() -> None:
+    knowledge, latest = _given_camera(), _keyframe(3).frame
+    agreeing = CameraEstimate((0.1, -0.2), 0.001, 0.0, 0.0, 0.001, (0.12, -0.25), 0.0, 0.05)
+    confirmed = judge_camera(knowledge, latest, agreeing, has_plane=True)
+    assert (confirmed.surer, confirmed.length_factor, confirmed.messages) == (True, None, [])
+    assert not judge_camera(confirmed.knowledge, latest, agreeing, has_plane=True).revises
+    replaced = judge_camera(knowledge, latest, replace(agreeing, log_focal=0.2), has_plane=True)
+    assert replaced.focal_replaced
+    assert replaced.length_factor == pytest.approx(math.exp(-0.2))
+    assert [message.code for message in replaced.messages] == ["focal-contradicted"]
+    focal, plane = 1.3 * math.exp(0.2), agreeing.tilt_free_focal
+    assert replaced.knowledge.focal == FocalLength(focal, 0.001, FocalOrigin.MOTION)
+    assert replaced.knowledge.plane == MetricPlane(focal, plane, True, 0.001)
+    for tilt_std, length_factor in ((0.1, None), (0.001, 1.0)):
+        check = judge_camera(knowledge, latest, replace(agreeing, tilt_std=tilt_std), has_plane=False)
+        assert (check.length_factor, check.revises) == (length_factor, length_factor is not None)
 
 
 def test_an_alignment_that_is_dropped_keeps_no_worker_busy() -> None:
