@@ -95,7 +95,7 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
         first = trials.lay_out(registration)
     except LimitError as error:
         first = error
-    if isinstance(first, LimitError) or first.seams.contradicted:
+    if isinstance(first, LimitError) or first.seams.mostly_unlike:
         registration, first = _plane_behind(registration, first, trials, aligner)
     tried = [first] if isinstance(first, CandidateLayout) else []
     for other in _alternatives(registration, tried, trials, aligner):
@@ -106,7 +106,7 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
     if isinstance(first, LimitError) and not tried:
         raise first
     best = _least_broken(tried, first)
-    if best.seams.by_chance and not options.force:
+    if best.seams.no_better_than_chance and not options.force:
         raise RefusedError(best.registration.with_messages([_BY_CHANCE]))
     return best
 
@@ -163,7 +163,7 @@ def _least_broken(tried: Sequence[CandidateLayout], given: CandidateLayout | Lim
     """The layout that the least speaks against; the one that was given unless another is clearly better."""
     first = tried[0]
     best = min((one for one in tried if one.clipped <= first.clipped), key=lambda one: (one.faults, one.broken))
-    broken = 0 if first.seams.fit else first.broken
+    broken = 0 if first.seams.seams_fit else first.broken
     clearly = best.faults < first.faults or best.broken <= _CLEARLY * broken
     return best if clearly or isinstance(given, LimitError) else first
 

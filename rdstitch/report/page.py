@@ -121,7 +121,7 @@ def summary(result: StitchResult | Registration) -> str:
     of_copies = f"; {more} more of copies" if (more := len(alignment.holding) - used) else ""
     known = {str(source.path) for source in registration.sources}
     unread = sum(message.images[0] not in known for message in registration.left_out)
-    seen = isinstance(result, StitchResult) and result.seams.visible
+    seen = isinstance(result, StitchResult) and result.seams.broken_in_output
     verdict = element("p", "The result passed its own checks.", class_="good")
     if seen:
         verdict = element("p", "Seams are broken; the picture below shows where.", class_="bad")

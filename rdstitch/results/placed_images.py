@@ -116,7 +116,7 @@ class PlacedImages:
         """As the compositor takes them, with only the near parts of those that a canvas does not show whole."""
         read: list[Callable[..., DecodedImage]] = [
             source.read if part is None else partial(_read_near, source.read, part)
-            for source, part in zip(self.sources, canvas.near or [None] * len(self.sources), strict=True)
+            for source, part in zip(self.sources, canvas.near, strict=True)
         ]
         if self.static is not None:
             common = Counter(camera.image_size for camera in self.cameras).most_common(1)[0][0]

@@ -16,7 +16,8 @@ from rdstitch.stage.coarse_tile import CORRELATED, Image
 _SMOOTHING = 1.2  # standard deviation of the filter before derivatives are taken, pixels
 _MARGIN = 5  # pixels of the second tile about a block that are looked at
 _STEP = 8  # pixels between which the lens is straight
-_ITERATIONS, _SETTLED = 5, 0.003  # pixels
+_ITERATIONS = 5
+_SETTLED = 0.003  # pixels that an iteration moves, which is the last one then
 _MIN_SIDE = 12  # pixels of a block
 _SIGNIFICANT = 5.0  # standard deviations by which the correlation of a block must exceed that of noise
 _CORRELATED = CORRELATED * _SMOOTHING**2  # pixels that share their noise after the filter
