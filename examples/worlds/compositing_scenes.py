@@ -16,8 +16,7 @@ from rdstitch.compositing.source_images import Displacement, ImageLoader
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import DecodedImage, Metadata
 from rdstitch.synthetic.poses import grid_poses
-from rdstitch.synthetic.rendering import Photometry, sequence_over
-from rdstitch.synthetic.rendering import Sequence as Rendering
+from rdstitch.synthetic.rendering import Photometry, RenderedSequence, sequence_over
 from rdstitch.synthetic.textures import ground
 
 
@@ -25,7 +24,7 @@ from rdstitch.synthetic.textures import ground
 class Scene:
     """Images of a plane with their true cameras and homographies, and the canvas they give."""
 
-    rendering: Rendering
+    rendering: RenderedSequence
     frames: Sequence[NDArray[Any]]
     cameras: Sequence[Camera]
     homographies: FloatArray
