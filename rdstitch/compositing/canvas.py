@@ -90,7 +90,7 @@ class Canvas:
         ]
 
     def _shifts(self, low: float, high: float) -> list[float]:
-        """From where an image is, pixels, to all its places on the canvas, which repeat themselves with each turn."""
+        """Shifts, pixels, from where an image is to all its places on the canvas, which repeat with each turn."""
         if self.period is None:
             return [0.0]
         turns = [k * self.period for k in range(-2, 3)]

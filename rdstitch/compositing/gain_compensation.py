@@ -77,7 +77,7 @@ def estimate_exposure(
 def _without_burning(
     exposure: Exposure, cells: Cells, survey: Survey, cameras: Sequence[Camera], workers: int
 ) -> Exposure:
-    """With images that follow their own brightness just as far as it takes to leave contrast in what is bright."""
+    """Have images follow their own brightness just as far as it takes to leave contrast in what is bright."""
     light, log = _samples(exposure, survey, cameras)
     unclipped = light.max(axis=1) < BRIGHTEST + exposure.offset
 

@@ -199,7 +199,7 @@ def _border_places(labels: NDArray[np.int32], label_size: float) -> tuple[IntArr
 
 
 def _searchable(inside: BoolArray) -> dict[int, BoolArray]:
-    """Where windows can be searched for in an image (h, w), by reach."""
+    """Mark where windows can be searched for in an image (h, w), by reach."""
     kernels = {reach: np.ones((2 * (_HALF + reach) + 1,) * 2, np.uint8) for reach in _REACHES}
     opaque, outside = inside.astype(np.uint8), cv2.BORDER_CONSTANT
     return {reach: cv2.erode(opaque, k, borderType=outside, borderValue=(0,)) > 0 for reach, k in kernels.items()}
@@ -215,7 +215,7 @@ class _Verdict(NamedTuple):
 def _comparable_places(
     first: tuple[SeamTile, dict[int, BoolArray]], second: tuple[SeamTile, dict[int, BoolArray]], at: FloatArray
 ) -> tuple[FloatArray, IntArray]:
-    """Those of the places (N, 2) of one border where windows fit into both tiles, and how far they can be searched."""
+    """Select places (N, 2) of a border where windows fit into both tiles; gives also how far they can be searched."""
     whole, reaches = np.rint(at).astype(np.intp), np.zeros(len(at), dtype=np.intp)
     (tile1, areas1), (tile2, areas2) = first, second
     for reach in _REACHES:
@@ -231,7 +231,7 @@ def _verdicts(
     near_border: Callable[[IntArray], BoolArray],
     contrast: float,
 ) -> Iterator[_Verdict | None]:
-    """Of each place (N, 2), pixels; None where neither image has texture."""
+    """Judge each place (N, 2), pixels; None where neither image has texture."""
     if not len(at):
         return
     windows1, windows2, near = _windows(first, at), _windows(second, at), near_border(at)

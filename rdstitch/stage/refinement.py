@@ -83,7 +83,7 @@ class _SampledPair:
 def _sampled_pair(
     first: NDArray[Any], second: NDArray[Any], block: IntArray, transfer: PointMap
 ) -> _SampledPair | None:
-    """As far as both tiles have what the search may need; None where that is too small."""
+    """Sample a block as far as both tiles have what the search may need; None where that is too small."""
     sides = np.array([first.shape[::-1], second.shape[::-1]])
     corners = np.array([block[[0, 1]], block[[2, 1]], block[[0, 3]], block[[2, 3]]], dtype=np.float64)
     off = corners - transfer(corners)
