@@ -131,7 +131,6 @@ class PlacedImages:
                 reader,
                 camera,
                 matrix,
-                reader,
                 source.metadata.exposure,
                 displacement,
                 str(source.path),

@@ -1,7 +1,6 @@
 """Overlaps, the light that they tell, the seams in them, and pixels that stay with the camera."""
 
 from collections.abc import Sequence
-from functools import partial
 from itertools import combinations, product
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from examples.worlds.compositing_scenes import as_image, place_images, render, side_by_side
+from examples.worlds.compositing_scenes import as_image, loader, place_images, render, side_by_side
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import cell_least_squares, field_fit, gain_compensation, overlap_cells, plan_canvas
 from rdstitch.compositing.boxes import intersection, overlapping_pairs
@@ -58,7 +57,7 @@ def _row(count: int, width: int = 32) -> tuple[Survey, list[PlacedImage]]:
     step = width / 2 / lens.scale
     places = np.array([[[1, 0, k * step], [0, 1, 0], [0, 0, 1]] for k in range(count)], dtype=np.float64)
     cameras = [lens] * count
-    images = place_images([partial(as_image, frame) for frame in frames], cameras, places)
+    images = place_images([loader(as_image(frame)) for frame in frames], cameras, places)
     return survey_images(ImageReader(images), images, plan_canvas(cameras, places)), images
 
 
@@ -173,7 +172,7 @@ def test_most_of_a_scene_may_be_black(black: float) -> None:
     ground[: round(48 * black)] = 0
     frames = [ground[:, :64].astype(np.uint8), (1.5 * ground[:, 32:]).astype(np.uint8)]
     places = np.array([[[1, 0, x / lens.scale], [0, 1, 0], [0, 0, 1]] for x in (0.0, 32.0)])
-    images = place_images([partial(as_image, frame) for frame in frames], [lens] * 2, places)
+    images = place_images([loader(as_image(frame)) for frame in frames], [lens] * 2, places)
     survey = survey_images(ImageReader(images), images, plan_canvas([lens] * 2, places))
     gains = np.exp(estimate_exposure(survey, images, "gain").log_gain)
     np.testing.assert_allclose(gains[1] / gains[0], 1.5, rtol=0.03)
