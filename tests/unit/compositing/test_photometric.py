@@ -22,6 +22,7 @@ from rdstitch.compositing.source_images import ImageReader, PlacedImage
 from rdstitch.compositing.static_pixels import static_pixels
 from rdstitch.compositing.survey import Survey, survey_images
 from rdstitch.compositing.warp import locate, plan_warp
+from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.conjugate_gradients import conjugate_gradients
 from rdstitch.synthetic import ground
@@ -177,6 +178,11 @@ def test_most_of_a_scene_may_be_black(black: float) -> None:
     gains = np.exp(estimate_exposure(survey, images, "gain").log_gain)
     np.testing.assert_allclose(gains[1] / gains[0], 1.5, rtol=0.03)
     assert 0.75 < gains[0].mean() < 0.95
+
+
+def test_an_exposure_that_is_not_finite_is_refused() -> None:
+    with pytest.raises(ArgumentError, match="not finite"):
+        Exposure(0.0, np.full((1, 3), np.nan))
 
 
 def test_an_image_without_overlap_has_the_gain_that_its_camera_wrote_down() -> None:
