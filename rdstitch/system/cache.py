@@ -121,7 +121,7 @@ class Cache:
         return self.recall_many(stage, [inputs], lambda _: [compute()])[0]
 
     def stored(self, stage: str, inputs: tuple[Any, ...], compute: Callable[[], Value]) -> Stored[Value]:
-        """As :meth:`recall`, but the result stays on disk until it is loaded."""
+        """Give what a stage gives for its inputs, which stays on disk until it is loaded; see :meth:`recall`."""
         if self.folder is None:
             return InMemory(compute())
         file = self._file(stage, inputs)
@@ -133,7 +133,7 @@ class Cache:
     def recall_many(
         self, stage: str, inputs: Sequence[tuple[Any, ...]], compute: Callable[[list[int]], list[Value]]
     ) -> list[Value]:
-        """As :meth:`recall`, of several; ``compute`` is called with the places of the inputs without a result."""
+        """Give what a stage gives for several inputs; ``compute`` gets the places of those without a result."""
         if self.folder is None:
             return compute(list(range(len(inputs))))
         files = [self._file(stage, of_one) for of_one in inputs]
