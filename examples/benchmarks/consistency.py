@@ -25,7 +25,7 @@ from rdstitch.errors import RdstitchError
 from rdstitch.geometry.camera import Camera, points_over
 from rdstitch.geometry.division_model import distort
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.synthetic import FisheyeLens, Photometry, Sequence, grid_poses, ground, hills, sequence_over
+from rdstitch.synthetic import FisheyeLens, Photometry, RenderedSequence, bumps, grid_poses, ground, sequence_over
 from rdstitch.synthetic.lenses import Lens, focal_length
 
 SIZE = (320, 240)
@@ -51,7 +51,7 @@ def camera(rng: np.random.Generator) -> Camera:
     )
 
 
-def rendered(kind: str, seed: int) -> Sequence:
+def rendered(kind: str, seed: int) -> RenderedSequence:
     """Images of a kind."""
     rng = np.random.default_rng((seed, KINDS.index(kind)))
     lens: Lens = camera(rng)
@@ -71,7 +71,7 @@ def rendered(kind: str, seed: int) -> Sequence:
         poses = grid_poses(lens, 3, 2, overlap=0.5, yaw=0.2, shift=0.1, seed=seed)
         poses = poses.shaken(seed=seed, height=0.1, tilt=0.0 if kind == "relief" else 0.12)
     height = float(np.mean(poses.height)) * (0.03, 0.06)[seed % 2]
-    relief = partial(hills, seed=seed, height=height, width=80) if kind == "relief" else None
+    relief = partial(bumps, seed=seed, height=height, width=80) if kind == "relief" else None
     return sequence_over(partial(ground, seed=seed), lens, poses, photometry=PHOTOMETRY, relief=relief, seed=seed)
 
 
@@ -89,7 +89,7 @@ def nearest_distortion(lens: Lens) -> float:
     return float(least_squares(missed, (-0.1, 1.0)).x[0])
 
 
-def errors(sequence: Sequence, alignment: Alignment) -> dict[str, FloatArray]:
+def errors(sequence: RenderedSequence, alignment: Alignment) -> dict[str, FloatArray]:
     """Errors of the numbers that were delivered, in their standard deviations."""
     result: dict[str, FloatArray] = {}
     if math.isfinite(alignment.distortion_std):

@@ -18,7 +18,7 @@ from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import Pair, PairRegistration
-from rdstitch.synthetic import Sequence
+from rdstitch.synthetic import RenderedSequence
 from rdstitch.synthetic.lenses import focal_length
 from rdstitch.synthetic.poses import pixels_of_texels, plane_outline
 from rdstitch.system.cache import Cache
@@ -37,7 +37,7 @@ _DISTORTION_STD = 0.01
 class DrawnMatches:
     """Matches of the images of a sequence; it stands for :class:`rdstitch.matching.pair_estimator.PairEstimator`."""
 
-    sequence: Sequence
+    sequence: RenderedSequence
     store: Cache = field(default_factory=Cache.for_this_run)
     progress: Progress = silent
 

@@ -26,7 +26,7 @@ from rdstitch.inputs.source import read_sources
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.register import register
 from rdstitch.pipeline.run import Run
-from rdstitch.synthetic import BrownLens, FisheyeLens, Sequence, grid_poses, ground, sequence_over
+from rdstitch.synthetic import BrownLens, FisheyeLens, RenderedSequence, grid_poses, ground, sequence_over
 from rdstitch.synthetic.lenses import Lens
 
 NAMES = ("fisheye 90", "fisheye 120", "fisheye 140", "phone", "action camera", "one parameter")
@@ -81,7 +81,7 @@ class Figures:
     percentile95: float
 
 
-def measure(name: str, seed: int, chosen: LensName, files: list[Path], sequence: Sequence) -> Figures:
+def measure(name: str, seed: int, chosen: LensName, files: list[Path], sequence: RenderedSequence) -> Figures:
     """One set through the registration, with a line of its own."""
     start = time.process_time()
     sources, _ = read_sources(files, camera=None, focal=None, distortion=None, skip_bad=False)

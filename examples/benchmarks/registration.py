@@ -24,7 +24,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.io.read import read_image
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
-from rdstitch.synthetic import Sequence
+from rdstitch.synthetic import RenderedSequence
 from rdstitch.system.process_memory import peak_memory
 
 MATCHES = 300
@@ -75,7 +75,7 @@ def _distortions(found: list[rdstitch.RadialHomography]) -> FloatArray:
     return np.array([one.distortion if one else np.inf for one in found])
 
 
-def print_mosaic(name: str, folder: Path, sequence: Sequence | None = None) -> None:
+def print_mosaic(name: str, folder: Path, sequence: RenderedSequence | None = None) -> None:
     """A line: processor time, λ, pairs, errors against the truth where it is known; and one of the stages."""
     stages = StageTimes()
     options = rdstitch.StitchOptions(workers=1, overwrite=True, force=True)
@@ -126,7 +126,7 @@ def main(
         print_pairs(pairs)
     print(f"\n{'processor time of mosaic, s':34s}{'whole':>8s}{'an image':>10s}{'a Mpx':>9s}")
     with TemporaryDirectory() as rendered:
-        work: list[tuple[str, Path, Sequence | None]] = []
+        work: list[tuple[str, Path, RenderedSequence | None]] = []
         if views:
             work.append(("12 views of 640 x 480", Path(rendered) / "views", SETS[0].sequence(seed=100)))
         if frames:

@@ -40,7 +40,7 @@ from rdstitch.pipeline.lay_out import align_registration_locally
 from rdstitch.pipeline.redraft import draft_with_loops
 from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.registration import Registration
-from rdstitch.synthetic import Photometry, Sequence, blank, ground, sequence_over
+from rdstitch.synthetic import Photometry, RenderedSequence, blank, ground, sequence_over
 from rdstitch.system.cache import Cache
 from rdstitch.system.process_memory import forget_peak_memory, take_over_memory
 from rdstitch.system.progress import Progress
@@ -55,7 +55,7 @@ _GRID = (5, 4)  # points of a frame at which its place is compared
 _LINKS = 2000  # of which the error of one frame against the other is taken
 
 
-def survey(count: int, size: str = SIZE, *, rendered: bool = True) -> Sequence:
+def survey(count: int, size: str = SIZE, *, rendered: bool = True) -> RenderedSequence:
     """A drone's survey of ``count`` frames that overlap by 70 % along a lane and by 50 % across."""
     width, height = map(int, size.split("x"))
     lens = Camera((width, height), DISTORTION, focal=0.8 * width)
@@ -69,14 +69,14 @@ def frame_order(count: int, shuffled: bool) -> list[int]:
     return np.random.default_rng(_SEED).permutation(count).tolist() if shuffled else list(range(count))
 
 
-def write_frames(sequence: Sequence, order: list[int], folder: Path) -> None:
+def write_frames(sequence: RenderedSequence, order: list[int], folder: Path) -> None:
     """Render the frames into a folder, one at a time."""
     for place, index in enumerate(order):
         write_image(folder / f"frame_{place:05d}.jpg", sequence.frame(index))
 
 
 def measure(
-    folder: Path, sequence: Sequence, order: list[int], workers: int, *, register_only: bool, drawn: bool
+    folder: Path, sequence: RenderedSequence, order: list[int], workers: int, *, register_only: bool, drawn: bool
 ) -> dict[str, Any]:
     """Stitch a folder of rendered frames in this process; what that cost, and how near it came to the truth."""
     drafts = iter(("draft",))
@@ -123,7 +123,7 @@ def measure(
     }
 
 
-def local_error(alignment: Alignment, sequence: Sequence, order: list[int]) -> float:
+def local_error(alignment: Alignment, sequence: RenderedSequence, order: list[int]) -> float:
     """Median distance, pixels, from where the alignment transfers points of a frame to, to where another shows them."""
     size, links = np.array(sequence.lens.image_size), list(alignment.support)
     grid = np.stack(np.meshgrid(*(np.linspace(0.0, 1.0, n) for n in _GRID)), axis=-1).reshape(-1, 2) * (size - 1.0)

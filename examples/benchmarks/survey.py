@@ -21,7 +21,7 @@ the field, on the grid of the first one): median shift against the first image, 
 import math
 import tempfile
 import time
-from collections.abc import Sequence as Several
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -42,8 +42,8 @@ from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.synthetic import sequence_over
 from rdstitch.synthetic.poses import Poses
-from rdstitch.synthetic.relief import hills
-from rdstitch.synthetic.rendering import Photometry, Sequence
+from rdstitch.synthetic.relief import bumps
+from rdstitch.synthetic.rendering import Photometry, RenderedSequence
 from rdstitch.synthetic.textures import ground
 
 _GSD, _HEIGHT = 0.1, 40.0
@@ -76,9 +76,9 @@ class Flight:
         self.std = (3.0, 5.0) if kind == "gps" else (0.02, 0.03)
         self.exif_focal = float(lens.focal or 1.0) * (1.0 + rng.normal(0.0, 0.02))
 
-    def rendered(self, lens: Camera, poses: Poses) -> Sequence:
+    def rendered(self, lens: Camera, poses: Poses) -> RenderedSequence:
         """The flight by a lens."""
-        relief = partial(hills, seed=self.seed, height=self.rise) if self.rise else None
+        relief = partial(bumps, seed=self.seed, height=self.rise) if self.rise else None
         photometry = Photometry(noise=0.01)
         return sequence_over(partial(ground, seed=self.seed), lens, poses, relief=relief, photometry=photometry)
 
@@ -163,7 +163,7 @@ def main(*, sets: int = 3, first: int = 0, kind: str | None = None) -> None:
             print(f"{each}: {np.median(shifts):.2f} pixels, largest {max(shifts):.2f}", flush=True)
 
 
-def _places(kind: str, seeds: Several[int]) -> None:
+def _places(kind: str, seeds: Sequence[int]) -> None:
     start, models, errors, said, squares = time.process_time(), [], [], [], []
     for seed in seeds:
         flight = Flight(kind, seed)

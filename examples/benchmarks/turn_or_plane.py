@@ -17,12 +17,12 @@ from rdstitch.errors import RdstitchError
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
+from rdstitch.synthetic import Photometry, RenderedSequence, grid_poses, ground, sequence_over
 
 BOTH = "a plane seen from one place would look the same"
 
 
-def turn(seed: int) -> Sequence:
+def turn(seed: int) -> RenderedSequence:
     """Two to six images of a camera that turns; every third one is held by hand, before things that are near."""
     rng = np.random.default_rng((seed, 5))
     lens = Camera((400, 300), float(rng.uniform(-0.35, 0.05)), focal=float(rng.uniform(0.6, 1.4) * 400.0))
@@ -40,7 +40,7 @@ def turn(seed: int) -> Sequence:
     )
 
 
-def plane(seed: int) -> Sequence:
+def plane(seed: int) -> RenderedSequence:
     """A set of :mod:`examples.worlds.trust_sets`, or images with tilts and heights of their own."""
     rng = np.random.default_rng((seed, 6))
     kind = str(rng.choice([*SOLVABLE, "free"]))

@@ -1,7 +1,6 @@
 """How well an estimated registration agrees with the truth, from its numbers: no image is looked at."""
 
-from collections.abc import Callable, Mapping
-from collections.abc import Sequence as Many
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -13,7 +12,7 @@ from rdstitch.alignment import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.radial_homography import to_plane
-from rdstitch.synthetic.rendering import Sequence
+from rdstitch.synthetic.rendering import RenderedSequence
 
 Transfer = Callable[[FloatArray], FloatArray]
 
@@ -51,7 +50,7 @@ class AlignmentError:
 
 
 def alignment_error(
-    sequence: Sequence,
+    sequence: RenderedSequence,
     transfers: Mapping[int, Transfer],
     *,
     model: str = "similarity",
@@ -90,9 +89,9 @@ def alignment_error(
 
 def registration_error(
     alignment: Alignment,
-    sequence: Sequence,
+    sequence: RenderedSequence,
     model: str | None = None,
-    order: Many[int] | None = None,
+    order: Sequence[int] | None = None,
     points_per_side: tuple[int, int] = (20, 15),
 ) -> AlignmentError:
     """:func:`alignment_error` of images that were aligned.

@@ -2,8 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable
-from collections.abc import Sequence as Many
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +15,7 @@ from examples.paper.common.report import Effort, Pixels, Report, Settings, Table
 from examples.paper.common.stitchers import Stitcher, installed_stitchers, run_all
 from rdstitch.geometry.camera import Camera
 from rdstitch.io.read import read_image
-from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
+from rdstitch.synthetic import Photometry, RenderedSequence, grid_poses, ground, sequence_over
 
 HEADER = (
     "stitcher", "exit", "median error, px", "95 % error, px", "coverage, %", "λ error",
@@ -40,7 +39,7 @@ class ImageSet:
     tilt: tuple[float, float]  # degrees
     yaw: float  # degrees, ±
 
-    def sequence(self, seed: int) -> Sequence:
+    def sequence(self, seed: int) -> RenderedSequence:
         """The images, with exposures that differ by ±15 %."""
         lens = Camera(self.size, self.distortion, focal=self.focal, focal_source="option")
         psi, theta = np.radians(self.tilt)
@@ -71,7 +70,7 @@ def run(settings: Settings) -> Report:
     return compare(settings, "end_to_end", chosen, 100, stitchers, notes, _measured)
 
 
-def _measured(mosaic: Pixels, sequence: Sequence, _: ImageSet) -> Measured:
+def _measured(mosaic: Pixels, sequence: RenderedSequence, _: ImageSet) -> Measured:
     """Errors are given in px of the images, for mosaics of any scale."""
     found = compare_with_plane(mosaic, sequence.texture, reachable=sequence.reachable(), search=SEARCH)
     return found.median * found.texels_per_pixel, found.percentile95 * found.texels_per_pixel, found.coverage
@@ -80,9 +79,9 @@ def _measured(mosaic: Pixels, sequence: Sequence, _: ImageSet) -> Measured:
 def compare(
     settings: Settings,
     name: str,
-    sets: Many[Any],
+    sets: Sequence[Any],
     first_seed: int,
-    stitchers: Many[Stitcher],
+    stitchers: Sequence[Stitcher],
     notes: tuple[str, ...],
     measured: Callable[[Pixels, Any, Any], Measured],
 ) -> Report:

@@ -4,7 +4,7 @@ Homographies of consecutive images, chained one after the other, add up the erro
 adjustment of all images spreads it, but images that are bent cannot fit: what is left are seams, and bent lanes.
 """
 
-from collections.abc import Sequence as Many
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,12 +23,12 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import project
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.registration import Registration
-from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over
+from rdstitch.synthetic import Photometry, RenderedSequence, ground, sequence_over
 
 _CENTRE = np.array([0.0, 0.0, 1.0])
 
 
-def rendered_survey(count: int, size: tuple[int, int], distortion: float, seed: int) -> Sequence:
+def rendered_survey(count: int, size: tuple[int, int], distortion: float, seed: int) -> RenderedSequence:
     """Images of a drone that keeps its height and attitude, as the two-point solver asks for; a texel is a pixel."""
     lens = Camera(size, distortion, focal=1.1 * size[0], focal_source="option")
     poses = survey_poses(lens, count, forward_overlap=0.6, side_overlap=0.4, height_jitter=0.0, seed=seed)
@@ -36,7 +36,7 @@ def rendered_survey(count: int, size: tuple[int, int], distortion: float, seed: 
     return sequence_over(lambda plane: ground(plane, seed), lens, poses, photometry=photometry, seed=seed)
 
 
-def true_centres(sequence: Sequence) -> FloatArray:
+def true_centres(sequence: RenderedSequence) -> FloatArray:
     """What each image's centre shows, texels, shape (N, 2)."""
     centre = np.array([sequence.lens.center])
     return np.concatenate([sequence.to_plane(index, centre) for index in range(len(sequence))])
@@ -164,7 +164,7 @@ def _rendered(count: int, size: tuple[int, int]) -> tuple[Table, _Paths]:
     return Table(title, (*_TOLD, *_MEASURED), tuple(rows)), paths
 
 
-def _real(files: Many[Path]) -> Table:
+def _real(files: Sequence[Path]) -> Table:
     """What can be said without truth: how well the matches agree."""
     rows = []
     with TemporaryDirectory(prefix="rdstitch-paper-") as folder:
@@ -183,5 +183,5 @@ def _told(variant: str, registration: Registration) -> tuple[object, ...]:
     return variant, int(alignment.used.sum()), alignment.distortion, alignment.model, alignment.rms
 
 
-def _failed(variant: str, reason: str, columns: Many[str]) -> tuple[object, ...]:
+def _failed(variant: str, reason: str, columns: Sequence[str]) -> tuple[object, ...]:
     return (variant, 0, None, f"failed: {reason}", None, *(None for _ in columns))

@@ -28,8 +28,7 @@ from rdstitch.geometry.radial_homography import project
 from rdstitch.io.read import read_image
 from rdstitch.matching.distortion_consensus import Consensus, vote
 from rdstitch.robust.measurements import Measurements
-from rdstitch.synthetic import ImageTexture, Poses, sequence_over
-from rdstitch.synthetic import Sequence as RenderedSequence
+from rdstitch.synthetic import ImageTexture, Poses, RenderedSequence, sequence_over
 
 _SQUARE = 80  # texels of a rendered chart
 _SQUARES = 30  # a side

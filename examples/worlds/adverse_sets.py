@@ -1,7 +1,7 @@
 """Rendered sets with what real images suffer from: bodies, vehicles, borders, blur, odd lenses and shutters, dirt.
 
-Each is a :class:`rdstitch.synthetic.Sequence`, so that the truth is known, and is judged as the other sets are; see
-:mod:`examples.worlds.trust_sets`.
+Each is a :class:`rdstitch.synthetic.RenderedSequence`, so that the truth is known, and is judged as the other sets are;
+see :mod:`examples.worlds.trust_sets`.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.synthetic import ImageTexture, Photometry, Sequence, grid_poses, ground, repeated, sequence_over
+from rdstitch.synthetic import ImageTexture, Photometry, RenderedSequence, grid_poses, ground, repeated, sequence_over
 
 ADVERSE = (
     "body", "vehicle", "banner", "round border", "curved border", "blurred", "off centre", "crops", "rolling shutter",
@@ -34,7 +34,7 @@ def _unchanged(index: int, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 @dataclass(frozen=True)
-class AlteredSequence(Sequence):
+class AlteredSequence(RenderedSequence):
     """Images of a surface, altered after they were taken.
 
     ``alter``: takes the index of an image and its pixels to other pixels of the same shape. ``shutter``: how far the
@@ -102,7 +102,7 @@ class RottenSequence(AlteredSequence):
         return paths
 
 
-def adverse_set(kind: str, seed: int) -> Sequence:
+def adverse_set(kind: str, seed: int) -> RenderedSequence:
     """A random set of one of :data:`ADVERSE`."""
     rng = np.random.default_rng((seed, ADVERSE.index(kind), 78))
     size = (400, 300)
@@ -133,13 +133,13 @@ def _region(size: tuple[int, int], share: float, rng: np.random.Generator) -> ND
     return regions[int(rng.integers(len(regions)))]
 
 
-def _body(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
+def _body(altered: AlteredSequence, rng: np.random.Generator) -> RenderedSequence:
     """A part of the robot in every image."""
     region = _region(altered.lens.image_size, float(rng.uniform(0.15, 0.4)), rng)
     return replace(altered, alter=_pasted(altered.lens.image_size, region, rng))
 
 
-def _banner(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
+def _banner(altered: AlteredSequence, rng: np.random.Generator) -> RenderedSequence:
     """A logo and a line of data in every image."""
     width, height = altered.lens.image_size
     region = np.zeros((height, width), dtype=np.bool_)
@@ -165,7 +165,7 @@ def _pasted(
     return paste
 
 
-def _vehicle(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
+def _vehicle(altered: AlteredSequence, rng: np.random.Generator) -> RenderedSequence:
     """A part of every image shows another plane, which moves little and otherwise."""
     size = altered.lens.image_size
     region = _region(size, float(rng.uniform(0.15, 0.4)), rng)
@@ -188,14 +188,14 @@ def _vehicle(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
     return replace(altered, alter=cover)
 
 
-def _round_border(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
+def _round_border(altered: AlteredSequence, rng: np.random.Generator) -> RenderedSequence:
     """Black outside a circle, as behind a microscope or a circular fisheye."""
     width, height = altered.lens.image_size
     u, v = np.meshgrid(np.arange(width) - width / 2, np.arange(height) - height / 2)
     return replace(altered, alter=_blackened(np.hypot(u, v) > rng.uniform(0.48, 0.6) * min(width, height) * 1.1))
 
 
-def _curved_border(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
+def _curved_border(altered: AlteredSequence, rng: np.random.Generator) -> RenderedSequence:
     """Black beyond a curve on two sides, as images have that were undistorted before."""
     width, height = altered.lens.image_size
     u, v = np.meshgrid(np.linspace(-1, 1, width), np.linspace(-1, 1, height))
@@ -212,7 +212,7 @@ def _blackened(outside: NDArray[np.bool_]) -> Callable[[int, NDArray[np.uint8]],
     return blacken
 
 
-def _blurred(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
+def _blurred(altered: AlteredSequence, rng: np.random.Generator) -> RenderedSequence:
     """One image out of focus."""
     which, sigma = int(rng.integers(len(altered))), float(rng.uniform(4.0, 8.0))
 
@@ -222,13 +222,13 @@ def _blurred(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
     return replace(altered, alter=blur, dispensable=frozenset({which}))
 
 
-def _crops(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
+def _crops(altered: AlteredSequence, rng: np.random.Generator) -> RenderedSequence:
     """Images cut from larger ones, each elsewhere, so that the lens's axis is not at one place in them."""
     far = 0.05 * float(np.hypot(*altered.lens.image_size))
     return replace(altered, offset=rng.uniform(-far, far, (len(altered), 2)))
 
 
-def _rolling_shutter(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
+def _rolling_shutter(altered: AlteredSequence, rng: np.random.Generator) -> RenderedSequence:
     """The camera moves on while its rows are read, by up to a tenth of the image, not always equally fast."""
     speed = rng.uniform(0.03, 0.1) * altered.lens.image_size[0]
     angle = rng.uniform(0.0, 2.0 * np.pi)
@@ -236,7 +236,7 @@ def _rolling_shutter(altered: AlteredSequence, rng: np.random.Generator) -> Sequ
     return replace(altered, shutter=speed * pace * np.array([[np.cos(angle), np.sin(angle)]]))
 
 
-def _cylinder(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
+def _cylinder(altered: AlteredSequence, rng: np.random.Generator) -> RenderedSequence:
     """A wall that is slightly curved along the way."""
     middle = float(altered.poses.position[:, 0].mean())
     reach = max(float(np.ptp(altered.poses.position[:, 0])), float(altered.lens.image_size[0]))
@@ -249,7 +249,7 @@ def _cylinder(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
     return replace(altered, height=height)
 
 
-def _dirt(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
+def _dirt(altered: AlteredSequence, rng: np.random.Generator) -> RenderedSequence:
     """Equal tiles, each with a stain of its own: drawn on the plane, so that they move with it."""
     width, height = altered.texture.size
     pixels = altered.texture.region(0, 0, width, height).copy()
@@ -259,13 +259,13 @@ def _dirt(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
     return replace(altered, texture=ImageTexture(pixels[:, :, 0] if pixels.shape[2] == 1 else pixels))
 
 
-def _bit_rot(altered: AlteredSequence, rng: np.random.Generator) -> Sequence:
+def _bit_rot(altered: AlteredSequence, rng: np.random.Generator) -> RenderedSequence:
     """A few flipped bits in one JPEG file."""
     own = {name: getattr(altered, name) for name in ("texture", "lens", "poses", "photometry", "seed")}
     return RottenSequence(**own, rotten=int(rng.integers(len(altered))), flips=int(2 ** rng.integers(0, 7)))
 
 
-_ALTERATIONS: dict[str, Callable[[AlteredSequence, np.random.Generator], Sequence]] = {
+_ALTERATIONS: dict[str, Callable[[AlteredSequence, np.random.Generator], RenderedSequence]] = {
     "body": _body,
     "vehicle": _vehicle,
     "banner": _banner,

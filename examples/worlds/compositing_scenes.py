@@ -1,6 +1,6 @@
 """Rendered sets with known homographies, for the compositor alone."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any
@@ -15,9 +15,9 @@ from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedImag
 from rdstitch.compositing.source_images import Displacement, ImageLoader
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import DecodedImage, Metadata
+from rdstitch.io.read import reduced
 from rdstitch.synthetic.poses import grid_poses
-from rdstitch.synthetic.rendering import Photometry, sequence_over
-from rdstitch.synthetic.rendering import Sequence as Rendering
+from rdstitch.synthetic.rendering import Photometry, RenderedSequence, sequence_over
 from rdstitch.synthetic.textures import ground
 
 
@@ -25,15 +25,15 @@ from rdstitch.synthetic.textures import ground
 class Scene:
     """Images of a plane with their true cameras and homographies, and the canvas they give."""
 
-    rendering: Rendering
+    rendering: RenderedSequence
     frames: Sequence[NDArray[Any]]
     cameras: Sequence[Camera]
     homographies: FloatArray
     canvas: Canvas
 
     @property
-    def sources(self) -> list[Callable[[], DecodedImage]]:
-        return [partial(as_image, frame) for frame in self.frames]
+    def sources(self) -> list[ImageLoader]:
+        return [loader(as_image(frame)) for frame in self.frames]
 
     @property
     def images(self) -> list[PlacedImage]:
@@ -41,7 +41,7 @@ class Scene:
 
     def composed(self, frames: Sequence[NDArray[Any]] | None = None, **options: Any) -> Composite:
         """The images, or other ones from the same places, as one."""
-        sources = self.sources if frames is None else [partial(as_image, frame) for frame in frames]
+        sources = self.sources if frames is None else [loader(as_image(frame)) for frame in frames]
         images = place_images(sources, self.cameras, self.homographies)
         return compose(images, self.canvas, CompositeOptions(**options))
 
@@ -54,6 +54,11 @@ class Scene:
 def as_image(frame: NDArray[Any], alpha: NDArray[np.uint8] | None = None) -> DecodedImage:
     """An image as if it had been read from a file."""
     return DecodedImage(frame, alpha, Metadata((frame.shape[1], frame.shape[0])))
+
+
+def loader(image: DecodedImage) -> ImageLoader:
+    """What reads an image that is in memory."""
+    return partial(reduced, image)
 
 
 def render(columns: int = 3, rows: int = 2, **options: Any) -> Scene:
@@ -108,7 +113,7 @@ def side_by_side(frames: Sequence[NDArray[Any]], places: Sequence[tuple[float, f
     homographies = np.tile(np.eye(3), (len(places), 1, 1))
     homographies[:, :2, 2] = np.array(places) / lens.scale
     cameras = [lens] * len(places)
-    images = place_images([partial(as_image, frame) for frame in frames], cameras, homographies)
+    images = place_images([loader(as_image(frame)) for frame in frames], cameras, homographies)
     return compose(images, plan_canvas(cameras, homographies), CompositeOptions(**options))
 
 
@@ -124,5 +129,5 @@ def place_images(
     """Images from lists of what is known of each; see :class:`PlacedImage`."""
     count, matrices = len(loaders), np.asarray(homographies, dtype=np.float64)
     nothing = [None] * count
-    more = (nothing, exposure or nothing, displacement or nothing, paths or [""] * count)
+    more = (exposure or nothing, displacement or nothing, paths or [""] * count)
     return [PlacedImage(*known) for known in zip(loaders, cameras, matrices, *more, strict=True)]

@@ -10,7 +10,7 @@ from examples.worlds.paths import drive_poses
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.geometry.camera import Camera
-from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over
+from rdstitch.synthetic import Photometry, RenderedSequence, ground, sequence_over
 
 DISTORTION = -0.25
 
@@ -24,7 +24,7 @@ def floor_drive(
     seed: int,
     size: tuple[int, int] = (640, 480),
     overlap: float = 0.8,
-) -> Sequence:
+) -> RenderedSequence:
     """Frames of one of :data:`PATHS`, through a lens of λ = :data:`DISTORTION` that is tilted by 3 and -2 degrees.
 
     ``count``: frames. ``seed``: of the floor and the noise. ``size``: width and height of the frames, px. ``overlap``:
@@ -36,7 +36,7 @@ def floor_drive(
     return sequence_over(floor, lens, poses, photometry=Photometry(noise=0.01), seed=seed)
 
 
-def true_path(sequence: Sequence) -> Trajectory:
+def true_path(sequence: RenderedSequence) -> Trajectory:
     """The path of a sequence's camera, in units of its first height."""
     p, unit = sequence.poses, sequence.poses.height[0]
     return Trajectory.from_poses(PlanarPoses(p.yaw, p.position / unit, p.height / unit, p.tilt))

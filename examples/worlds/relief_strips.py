@@ -13,7 +13,7 @@ from rdstitch.matching.links import Link
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies
-from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
+from rdstitch.synthetic import RELIEFS, RenderedSequence, blank, grid_poses, sequence_over
 
 LENS = Camera((640, 480), -0.2, focal=520.0)
 _MATCHES = 300
@@ -26,7 +26,7 @@ _OPTIONS = EstimationOptions(select_below=50)
 class Strip:
     """Images in a row, each linked with the three after it."""
 
-    truth: Sequence  # not meant to be rendered
+    truth: RenderedSequence  # not meant to be rendered
     distortion: float  # its λ
     cameras: list[Camera]  # without λ
     links: list[Link]
@@ -65,7 +65,7 @@ def strip(kind: str, height: float, seed: int, images: int) -> Strip:
     return Strip(truth, lens.distortion, [Camera(lens.image_size).with_guessed_focal() for _ in range(images)], links)
 
 
-def _matches(truth: Sequence, i: int, j: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+def _matches(truth: RenderedSequence, i: int, j: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Points of the ground that both images see, with noise; a tenth of them matched wrongly."""
     width, height = truth.lens.image_size
     points1 = rng.uniform((5.0, 5.0), (width - 6.0, height - 6.0), (_MATCHES, 2))

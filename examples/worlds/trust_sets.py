@@ -23,7 +23,7 @@ from rdstitch.synthetic import (
     Lens,
     Photometry,
     Poses,
-    Sequence,
+    RenderedSequence,
     Texture,
     gradient,
     grid_poses,
@@ -54,10 +54,10 @@ MAX_MEDIAN, MAX_OF_AN_IMAGE = 1.5, 4.0
 
 
 @dataclass(frozen=True)
-class MixedSequence(Sequence):
+class MixedSequence(RenderedSequence):
     """Images of one plane of which some were taken with another lens, or show other ground."""
 
-    other: Sequence | None = None  # the same poses with what else there is
+    other: RenderedSequence | None = None  # the same poses with what else there is
     taken: frozenset[int] = frozenset()  # images that come from ``other``
     usable: bool = False  # whether these may be registered rightly with the rest
     damaged: bool = False  # whether their files are cut off or have flipped bits
@@ -75,8 +75,8 @@ class MixedSequence(Sequence):
             paths[index].write_bytes(data)
         return paths
 
-    def _of(self, index: int) -> Sequence:
-        own = Sequence(self.texture, self.lens, self.poses, self.photometry, seed=self.seed)
+    def _of(self, index: int) -> RenderedSequence:
+        own = RenderedSequence(self.texture, self.lens, self.poses, self.photometry, seed=self.seed)
         return self.other if index in self.taken and self.other is not None else own
 
     def to_plane(self, index: int, points: ArrayLike) -> FloatArray:
@@ -92,7 +92,7 @@ class MixedSequence(Sequence):
 @dataclass(frozen=True)
 class TrustSet:
     kind: str  # one of :data:`SOLVABLE`, :data:`ODD`, :data:`HOPELESS` or :data:`examples.worlds.adverse_sets.ADVERSE`
-    sequence: Sequence
+    sequence: RenderedSequence
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ def _poses(kind: str, lens: Lens, tilt: tuple[float, float], rng: np.random.Gene
     return grid_poses(lens, columns, rows, overlap=overlap, yaw=0.2, shift=0.05, tilt=tilt, seed=seed)
 
 
-def _mixed(kind: str, sequence: Sequence, rng: np.random.Generator, seed: int) -> MixedSequence:
+def _mixed(kind: str, sequence: RenderedSequence, rng: np.random.Generator, seed: int) -> MixedSequence:
     """Some images through another lens (a zoom), or over other ground."""
     lens, usable, damaged = sequence.lens, False, False
     if kind == "mixed lenses":
@@ -247,7 +247,7 @@ def judge_set(item: TrustSet, folder: Path, options: StitchOptions | None = None
     return Judged(item.kind, 0, right, complete, error, text, warned, codes)
 
 
-def registration_error(sequence: Sequence, registration: Registration) -> tuple[float, float]:
+def registration_error(sequence: RenderedSequence, registration: Registration) -> tuple[float, float]:
     """Median error of the images used, and that of the worst of them, px, up to one homography of the plane."""
     alignment = registration.alignment
     order = [_number(source.path.name) for source in registration.sources]
@@ -255,7 +255,7 @@ def registration_error(sequence: Sequence, registration: Registration) -> tuple[
     return measured.median, max(measured.per_image().values())
 
 
-def overlap_error(sequence: Sequence, registration: Registration) -> tuple[float, float]:
+def overlap_error(sequence: RenderedSequence, registration: Registration) -> tuple[float, float]:
     """Median error where images overlap, and that of the worst pair, px."""
     alignment = registration.alignment
     errors = []

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from rdstitch.arrays import FloatArray
 from rdstitch.synthetic.lenses import Lens, focal_length
 from rdstitch.synthetic.poses import Poses
-from rdstitch.synthetic.rendering import Photometry, Sequence
+from rdstitch.synthetic.rendering import Photometry, RenderedSequence
 from rdstitch.synthetic.textures import LinearPixels, Texture, ground
 
 
@@ -68,7 +68,7 @@ class _Around:
 
 
 @dataclass(frozen=True, eq=False)
-class TurningSequence(Sequence):
+class TurningSequence(RenderedSequence):
     """Images of a camera that turns about its centre; made by :func:`turning_sequence`.
 
     ``rotations`` (N, 3, 3) are those from the scene to each camera; ``position`` (N, 3) is each camera's centre in

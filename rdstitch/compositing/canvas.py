@@ -39,10 +39,14 @@ class Canvas:
     projection: Projection = PLANE  # what ``matrix`` is applied to: the places that it gives to directions
     # width of a full turn, pixels, where the images go all the way round; None where they do not
     period: float | None = None
-    near: tuple[VisibleRegion | None, ...] = ()  # what of each image is drawn; None for all of it, empty for all of all
+    near: tuple[VisibleRegion | None, ...] = ()  # what of each image is drawn; None, as by default: all
     # (3, 3): what the registered images were turned by before, as it is recorded; None where they were not
     orientation: FloatArray | None = None
     cropped_to: Box | None = None  # what a crop leaves, instead of the largest part without holes
+
+    def __post_init__(self) -> None:
+        if not self.near:
+            object.__setattr__(self, "near", (None,) * len(self.footprints))
 
     @property
     def from_level_plane(self) -> FloatArray | None:
@@ -71,7 +75,7 @@ class Canvas:
         return replace(self, size=size, matrix=matrix, footprints=outlines)
 
     def areas(self) -> list[int]:
-        """Of the bounds of every image, as if it had only one place on the canvas, square pixels."""
+        """Area of the bounds of every image, as if it had only one place on the canvas, square pixels."""
         if self.period is None:
             return [(x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in map(self.box, range(len(self.footprints)))]
         sizes = [np.minimum(np.ptp(outline, axis=0) + 1, self.size) for outline in self.footprints]
@@ -86,7 +90,7 @@ class Canvas:
         ]
 
     def _shifts(self, low: float, high: float) -> list[float]:
-        """From where an image is, pixels, to all its places on the canvas, which repeat themselves with each turn."""
+        """Shifts, pixels, from where an image is to all its places on the canvas, which repeat with each turn."""
         if self.period is None:
             return [0.0]
         turns = [k * self.period for k in range(-2, 3)]
@@ -105,7 +109,7 @@ class Canvas:
         drawn = []
         for k, (camera, matrix) in enumerate(zip(cameras, homographies, strict=True)):
             points = points_over(camera.image_size, PROBES)
-            part, places = self.near[k] if self.near else None, self.place(camera, matrix, points)
+            part, places = self.near[k], self.place(camera, matrix, points)
             with np.errstate(invalid="ignore"):
                 outside = (places < -1.0) | (places > np.array(self.size))
                 inside = np.isfinite(places).all(axis=1) & ~outside[:, 1 if self.period else 0 :].any(axis=1)

@@ -12,9 +12,8 @@ from rdstitch.system.late_imports import sparse, sparse_linalg
 VISIBLE = 0.004  # log units, a grey level of a light sample: differences below are as good as none
 DECIMALS = 5  # of solutions, that are kept: far below a grey level
 _TUKEY = 3.0  # standard deviations from which on an error counts for nothing
-# The mode of an overlap is sought with this share of its cells: the rest may be other content. Of normal errors, this
-# share lies within so many standard deviations.
-_CORE, _CORE_SIGMA = 0.3, 0.385
+_CORE = 0.3  # fraction of the cells of an overlap with which its mode is sought: the rest may be other content
+_CORE_SIGMA = 0.385  # standard deviations within which that fraction of normal errors lies
 _ROUNDS = 6
 _TOLERANCE = 1e-4  # residual, as a share of the right side: far below a grey level
 

@@ -45,7 +45,7 @@ class Composite:
 
 @dataclass(frozen=True, repr=False)
 class FileComposite:
-    """A stitched image that went to a file; attributes as of :class:`Composite`."""
+    """A stitched image that went to a file."""
 
     canvas: Canvas
     fingerprint: Fingerprint  # size and digest of the file
@@ -62,7 +62,7 @@ def compose(images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOpt
 def compose_decided(
     decisions: Decisions, progress: FractionProgress = no_progress, elsewhere: BlockRunner | None = None
 ) -> Composite:
-    """The same once exposure and seams are decided.
+    """Put images together, in memory, once exposure and seams are decided.
 
     ``elsewhere`` computes the pixels in blocks, in other processes; see :mod:`rdstitch.compositing.tiles`.
     """
@@ -89,7 +89,7 @@ def compose_to_file(
     extra_tags: Callable[[Canvas], Iterable[ExtraTag]] = lambda canvas: (),
     outputs: Outputs | None = None,
 ) -> FileComposite:
-    """As :func:`compose_decided`, straight into a file, whatever its size: memory is that of a strip of tiles.
+    """Put images together straight into a file, whatever its size: memory is that of a strip of tiles.
 
     ``extra_tags`` gives further tags of a TIFF file for the canvas after cropping; without ``outputs`` the file
     replaces what is there.

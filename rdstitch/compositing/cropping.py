@@ -1,5 +1,7 @@
 """What a crop leaves of the canvas: its largest part without holes."""
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +24,15 @@ def covered_pixels(survey: Survey) -> NDArray[np.bool_]:
     return covered
 
 
-def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> tuple[Box | None, str]:
-    """Largest rectangle without holes, on the canvas, and, when there is none worth having, why.
+class Crop(NamedTuple):
+    """The largest part of a canvas without holes."""
+
+    box: Box | None  # on the canvas; None where it is not worth cropping to
+    kept: float  # fraction of what is covered that it keeps
+
+
+def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> Crop:
+    """Find the largest rectangle without holes.
 
     ``covered`` as of :func:`covered_pixels`, of which each takes ``factor`` pixels a side of a canvas of this size.
     """
@@ -37,13 +46,13 @@ def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> 
     x0, y0, x1, y1 = largest_rectangle(cells)
     kept = (x1 - x0) * (y1 - y0) * coarse**2 / max(1, int(covered.sum()))
     if kept < _MIN_KEPT:
-        return None, f"not cropped: the largest rectangle without holes would keep {100 * kept:.0f} % of the image"
+        return Crop(None, kept)
     unit = coarse * factor
-    return (x0 * unit, y0 * unit, min(x1 * unit, size[0]), min(y1 * unit, size[1])), ""
+    return Crop((x0 * unit, y0 * unit, min(x1 * unit, size[0]), min(y1 * unit, size[1])), kept)
 
 
-def crop_rows(covered: NDArray[np.bool_], factor: int, size: tuple[int, int], whole: Box) -> tuple[Box | None, str]:
-    """As :func:`crop_box`, for a canvas that goes all the way round: rows without holes, at their full width.
+def crop_rows(covered: NDArray[np.bool_], factor: int, size: tuple[int, int], whole: Box) -> Crop:
+    """Find the most rows without holes, at their full width, of a canvas that goes all the way round.
 
     ``whole`` is one full turn of it.
     """
@@ -53,10 +62,10 @@ def crop_rows(covered: NDArray[np.bool_], factor: int, size: tuple[int, int], wh
     first, last = edges[np.argmax(np.diff(edges, axis=1))] if len(edges) else (0, 0)
     # A reduced pixel stands for those around its centre: one row less on each side makes sure of all of them.
     first, last = first + (first > 0), last - (last < len(covered))
-    kept = (last - first) * covered.shape[1] / max(1, int(covered.sum()))
+    kept = max(0, int(last - first)) * covered.shape[1] / max(1, int(covered.sum()))
     if kept < _MIN_KEPT:
-        return None, f"not cropped: the rows without holes would keep {max(0.0, 100 * kept):.0f} % of the image"
-    return (whole[0], int(first) * factor, whole[2], min(int(last) * factor, size[1])), ""
+        return Crop(None, kept)
+    return Crop((whole[0], int(first) * factor, whole[2], min(int(last) * factor, size[1])), kept)
 
 
 def largest_rectangle(cells: NDArray[np.bool_]) -> Box:

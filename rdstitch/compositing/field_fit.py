@@ -12,13 +12,14 @@ from rdstitch.compositing.photometric import bilinear_weights
 from rdstitch.geometry.camera import Camera
 from rdstitch.system.late_imports import sparse
 
-# Along each side of an image; of more than some 1,000 images fewer, so that the system stays bounded.
-_NODES, _MAX_NODES = 7, 50_000
+_NODES = 7  # along each side of an image
+_MAX_NODES = 50_000  # of all images: of more than some 1,000 each has fewer, so that the system stays bounded
 _CELL_SIGMA = 0.03  # how well fields can explain the means of a cell, log units
-# How far a field may stray from 0, and rise, and bend, from one side of an image to the other. Where images follow
-# their own brightness, they do so to the second figure, and over a distance of that by the third, in images.
-_FIELD_SIGMA, _OWN_SIGMA = 0.3, 0.02
-_RISE_SIGMA, _BEND_SIGMA = 0.1, 0.5
+_FIELD_SIGMA = 0.3  # log units that a field may stray from 0
+# Log units to which images follow their own brightness, where they do: over _OWN_SIGMA / _RISE_SIGMA of an image.
+_OWN_SIGMA = 0.02
+_RISE_SIGMA = 0.1  # log units that a field may rise from one side of an image to the other
+_BEND_SIGMA = 0.5  # log units that it may bend
 
 
 def fit_fields(

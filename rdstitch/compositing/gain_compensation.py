@@ -30,9 +30,10 @@ from rdstitch.options.composite_options import ExposureMethod
 from rdstitch.system.late_imports import sparse
 
 _SRGB_OFFSET = 0.055
-# The brightest thousandth may be brightened to where compression leaves three quarters of its contrast; beyond, images
-# follow their own brightness.
-_WHITE_QUANTILE, _MAX_WHITE = 0.999, KNEE + (1.0 - KNEE) / math.sqrt(0.75)
+_WHITE_QUANTILE = 0.999  # of the samples, which is the white that is brightened
+# Share of the full range up to which white may be brightened, where compression leaves three quarters of its contrast;
+# beyond, images follow their own brightness.
+_MAX_WHITE = KNEE + (1.0 - KNEE) / math.sqrt(0.75)
 _MEDIAN_SAMPLES = 10_000  # of all images together
 
 
@@ -76,7 +77,7 @@ def estimate_exposure(
 def _without_burning(
     exposure: Exposure, cells: Cells, survey: Survey, cameras: Sequence[Camera], workers: int
 ) -> Exposure:
-    """With images that follow their own brightness just as far as it takes to leave contrast in what is bright."""
+    """Have images follow their own brightness just as far as it takes to leave contrast in what is bright."""
     light, log = _samples(exposure, survey, cameras)
     unclipped = light.max(axis=1) < BRIGHTEST + exposure.offset
 

@@ -15,12 +15,13 @@ from rdstitch.system.late_imports import sparse
 
 MIN_RELATIVE_GAIN = 0.05  # a model with more freedom must explain the data better by this share to be taken
 
-# How well the gains of two images can explain their overlap, and how far gains stray (log units): keeps long chains
-# from drifting. The last where the camera has written its exposure down: tone curves and apertures are not exact.
-_PAIR_SIGMA, _GAIN_SIGMA, _EXIF_SIGMA = 0.02, 0.5, 0.15
+_PAIR_SIGMA = 0.02  # log units to which the gains of two images can explain their overlap
+_GAIN_SIGMA = 0.5  # log units that gains stray, which keeps long chains from drifting
+_EXIF_SIGMA = 0.15  # the same where the camera wrote its exposure down: tone curves and apertures are not exact
 # Power of the light that samples follow, for the prior: sRGB above its toe, or raw light.
 _SRGB_POWER = 2.4
-_VIGNETTING_SIGMA, _VIGNETTING_RANGE = 1.0, (0.15, 1.25)
+_VIGNETTING_SIGMA = 1.0  # of each coefficient
+_VIGNETTING_RANGE = 0.15, 1.25  # of the light of the middle, that may be left at any radius
 
 
 @dataclass(frozen=True, eq=False)

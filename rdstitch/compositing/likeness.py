@@ -12,7 +12,9 @@ from rdstitch.arrays import BoolArray, IntArray
 from rdstitch.compositing.boxes import Float32Array, cut, intersection
 from rdstitch.compositing.seam_quality import CONTRAST, UNLIKE, SeamTile, correlation
 
-_COARSER, _CELL, _MIN_CELLS = 3, 13, 8  # overlaps are compared so many times smaller, in cells; fewer say nothing
+_COARSER = 3  # times smaller, that overlaps are compared
+_CELL = 13  # pixels a side
+_MIN_CELLS = 8  # fewer say nothing
 
 
 class Likeness(NamedTuple):

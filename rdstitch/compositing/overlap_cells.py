@@ -15,16 +15,15 @@ from rdstitch.compositing.photometric import full_scale
 from rdstitch.compositing.survey import Survey, SurveyTile
 from rdstitch.system.late_imports import sparse
 
-# Along the longest side of an image or an overlap, and of all overlaps together: of thousands, each needs fewer.
-_CELLS, _MAX_CELLS = 16, 150_000
+_CELLS = 16  # along the longest side of an image or an overlap
+_MAX_CELLS = 150_000  # of all overlaps together: of thousands, each needs fewer
 _CLIPPED, _MOMENTS = 4, 5  # means of a cell after those of its samples: see _cells_of_overlap
 _PAIRS_AT_A_TIME = 64  # that a thread compares: tens of milliseconds of work
 _SAMPLES = 10  # pixels along each side of a cell that are looked at, at least, where it has so many
-# Integer samples outside this part of the range are clipped or mostly noise.
-_DARKEST, BRIGHTEST = 0.02, 0.97
-# Deviation within a cell, share of the samples' median, below which a pattern is hardly more than noise; and what a
-# cell without any counts beside one with a pattern.
-_PLAIN, _PLAIN_COUNTS = 0.01, 0.1
+_DARKEST = 0.02  # share of the full range: below, integer samples are mostly noise
+BRIGHTEST = 0.97  # share of the full range: above, integer samples are clipped
+_PLAIN = 0.01  # deviation within a cell, share of the samples' median: below, a pattern is hardly more than noise
+_PLAIN_COUNTS = 0.1  # what a cell without a pattern counts beside one with
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,8 +99,8 @@ def plan_panorama(
 ) -> Canvas:
     """Plan the canvas that holds every image of a panorama.
 
-    As :func:`rdstitch.compositing.plan_canvas`. What the projection would stretch more than ``max_stretch`` times has
-    no place on it: the ends of a plane, the top and the bottom of a cylinder.
+    Arguments are those of :func:`rdstitch.compositing.plan_canvas`. What the projection would stretch more than
+    ``max_stretch`` times has no place on it: the ends of a plane, the top and the bottom of a cylinder.
     """
     called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)
     check_placement(cameras, directions, scale, rotate, reference, called, max_stretch)

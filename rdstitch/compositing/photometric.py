@@ -41,8 +41,8 @@ class Exposure:
     log_gain: FloatArray  # (N, C): log of what image i is brighter by than the average
     # (3,): coefficients of r², r⁴, r⁶ in log(v + b); r in half diagonals from the distortion centre
     vignetting: FloatArray = field(default_factory=lambda: np.zeros(3))
-    # (N, B, B, C), or: smooth remainder on a grid over each image (rows, columns), log of what the image is brighter by
-    # there
+    # (N, B, B, C), or (0, 0, 0, 0) without one: smooth remainder on a grid over each image (rows, columns), log of what
+    # the image is brighter by there
     fields: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0, 0)))
     # brightest corrected sample, share of the full range: what is brightened is compressed, so that nothing up to there
     # becomes full scale but full scale itself; 1: it is clipped

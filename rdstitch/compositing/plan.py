@@ -13,15 +13,18 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.system.machine import available_memory, processor_count
 
-_SHARE, _LEAST = 0.25, 400 * 2**20  # of the memory that is available, and bytes that are taken in any case
+_SHARE = 0.25  # of the memory that is available
+_LEAST = 400 * 2**20  # bytes that are taken in any case
 _TILE_SIZES = (512, 256)
 _MAX_WORKERS = 4
 _MAX_BANDS = 4
-# Arrays of the size of a tile with its margin that live at one time (float32): samples and sums of the pyramids in each
-# channel, and coordinates, weights, owners.
-_LIVE_PER_CHANNEL, _LIVE_PLANES, _LIVE_STRIPS = 5.0, 12.0, 4.5
-# Seconds per megapixel of output, per megapixel of input, on one core of a machine of 2020; for an estimate only.
-_SECONDS_OUT, _SECONDS_IN = 0.15, 0.03
+# Arrays of float32 of the size of a tile with its margin that live at one time.
+_LIVE_PER_CHANNEL = 5.0  # samples and sums of the pyramids
+_LIVE_PLANES = 12.0  # coordinates, weights, owners
+_LIVE_STRIPS = 4.5  # strips of the output, in its samples
+# For an estimate only, on one core of a machine of 2020.
+_SECONDS_OUT = 0.15  # per megapixel of output
+_SECONDS_IN = 0.03  # per megapixel of input
 
 
 @dataclass(frozen=True)

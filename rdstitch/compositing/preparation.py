@@ -73,7 +73,7 @@ class Decisions:
 
     @property
     def canvas(self) -> Canvas:
-        """Of the output."""
+        """Where every image lies in the output."""
         canvas = self.task.canvas
         return canvas if self.box == (0, 0, *canvas.size) else canvas.cropped(self.box)
 
@@ -94,8 +94,11 @@ def decide(images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOpti
         seams, quality = _decide_seams(task, survey, exposure)
     if options.crop == "auto" and cropped is None:
         find = crop_box if task.turn is None else partial(crop_rows, whole=task.turn)
-        cropped, note = find(covered_pixels(survey), survey.factor, task.canvas.size)
-        messages = [*messages, Message(note)] if note else messages
+        cropped, kept = find(covered_pixels(survey), survey.factor, task.canvas.size)
+        if cropped is None:
+            what = "largest rectangle" if task.turn is None else "rows"
+            text = f"not cropped: the {what} without holes would keep {100 * kept:.0f} % of the image"
+            messages = [*messages, Message(text)]
     box = cropped if cropped is not None and options.crop == "auto" else whole
     return Decisions(task, exposure, seams, box, tuple(messages), quality.cropped(box))
 

@@ -60,7 +60,7 @@ class Plane(Projection):
         return x, y, np.ones(())
 
     def extent(self, max_stretch: float) -> tuple[float, float]:
-        """Where areas grow along an axis as the square of the distance."""
+        """The limit where areas grow along an axis as the square of the distance."""
         reach = math.sqrt(min(max_stretch, _MAX_STRETCH) - 1.0)
         return reach, reach
 
@@ -81,7 +81,7 @@ class _Longitude(Projection):
             return np.sin(x), self._slope(y), np.cos(x)
 
     def extent(self, max_stretch: float) -> tuple[float, float]:
-        """All longitudes."""
+        """The limit in latitude; all longitudes."""
         return math.inf, self._highest(min(max_stretch, _MAX_STRETCH))
 
     @abstractmethod

@@ -111,7 +111,7 @@ class Renderer:
 
     @cached_property
     def _bounds(self) -> NDArray[np.intp]:
-        """Of every image, (N, 4): tiles look at all of them."""
+        """Boxes of all images, (N, 4): tiles look at all of them."""
         return np.array([warp.box for warp in self.warps], dtype=np.intp).reshape(-1, 4)
 
     def layer(self, index: int, box: Box) -> tuple[NDArray[Any], NDArray[np.bool_], NDArray[np.bool_]]:

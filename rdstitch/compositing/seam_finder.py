@@ -26,17 +26,20 @@ from rdstitch.system.ahead import in_order_ahead
 
 NO_OWNER = -1
 
-# Band in which a seam may wander: the new image's share of both border weights. Its edges count as such a difference of
-# brightness: where nothing differs, a seam keeps to the middle, and what moves is gone round on either side.
-_MIN_WEIGHT, _MAX_WEIGHT, _ASIDE = 0.1, 0.9, 0.04
-_AROUND_FREE = 2
+# Band in which a seam may wander, by the new image's share of both border weights.
+_MIN_WEIGHT = 0.1
+_MAX_WEIGHT = 0.9
+# Difference of brightness, share of the full range, that the edges of that band count as: where nothing differs, a seam
+# keeps to the middle, and what moves is gone round on either side.
+_ASIDE = 0.04
+_AROUND_FREE = 2  # pixels around the free ones that a cut sees
 _AHEAD = 4  # images that are prepared before their cuts
-# What a difference of edges, a pixel, counts beside one of brightness, and the root of the largest cost of a pixel, in
-# that of the length of a seam; OpenCV's cut keeps to what it must separate up to a cost of 10,000.
-_EDGES, _VISIBLE = 2.0, 64.0
-# pixels from which on a cut is found at half the size first, and by how much it may then move.
-_MAX_CUT = 15_000
-_MOVED = 3
+_EDGES = 2.0  # what a difference of edges, a pixel, counts beside one of brightness
+# Root of the largest cost of a pixel, in that of the length of a seam; OpenCV's cut keeps to what it must separate up
+# to a cost of 10,000.
+_VISIBLE = 64.0
+_MAX_CUT = 15_000  # pixels: a larger cut is found at half the size first
+_MOVED = 3  # pixels by which it may then move
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,8 +202,8 @@ def _around(free: NDArray[np.bool_]) -> tuple[slice, slice]:
 def _visibility(first: NDArray[Any], second: NDArray[Any], weight_fraction: Float32Array) -> Float32Array:
     """How much a seam shows at each pixel (h, w): the square of what two images differ by in brightness and in edges.
 
-    One broken edge shows more than many small differences. ``share`` of both border weights says how far it is from the
-    middle.
+    One broken edge shows more than many small differences. ``weight_fraction``, the second image's of both border
+    weights, says how far it is from the middle.
     """
     difference = first.astype(np.float32) - second
     # A product is much faster than a mean over a short axis.

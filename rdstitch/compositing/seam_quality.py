@@ -22,21 +22,25 @@ from rdstitch.compositing.seam_lines import SeamLines
 from rdstitch.system.late_imports import csgraph
 
 DIAGONAL = 1000.0  # pixels of an image's diagonal at which seams are looked at: about what a screen shows of it
-_HALF, _STEP = 12, 8  # half a window, and how far windows are apart
-_REACHES = 8, 16  # how far a window is searched for, the shorter where the image ends
+_HALF = 12  # half a window, pixels
+_STEP = 8  # pixels from one window to the next
+_REACHES = 8, 16  # pixels that a window is searched for within, the shorter where the image ends
 _BORDER = 2  # pixels on either side of a seam at which a difference shows
 # Of the range of grey levels: standard deviation in a window that has texture, and of a difference that is seen.
 CONTRAST = 6.0 / 255.0
-_ALIKE, _GAIN, _MOVED = 0.75, 0.2, 3.0  # correlation of a moved window, its lead, and by how much it is moved
+_ALIKE = 0.75  # correlation of a moved window
+_GAIN = 0.2  # by which that is more than the correlation of the window where it is
+_MOVED = 3.0  # pixels that such a window is moved by
 UNLIKE = 0.4  # correlation below which edges on both sides are not the same
-# Share of the overlaps that images of a scene reach where they do not belong, in nine of ten cases (0.1 in the median);
-# and share that what fills less than half of the images cannot reach.
-_CHANCE, _MIN_ALIKE = 0.2, 0.5
+# Fraction of the overlaps that images reach where they do not belong, in nine of ten cases (0.1 in the median).
+_CHANCE = 0.2
+_MIN_ALIKE = 0.5  # fraction that what fills less than half of the images cannot reach
 # Coherence of edges (0: all directions, 1: one) from which on they are an object's, and no leaves or gravel.
 _DIRECTED = 0.4
 _MIN_LINE = 2 * _HALF  # pixels of a line that a person follows: longer than the window that it crosses
 _NEXT = 2.2 * _STEP  # pixels up to which places of a border follow each other
-_MAX_BROKEN, _MIN_BROKEN = 0.03, 3  # of the places that may be broken before a person sees it
+_MAX_BROKEN = 0.03  # fraction of the places that may be broken before a person sees it
+_MIN_BROKEN = 3  # places: fewer are not seen
 _MAX_LENGTH = 0.045  # of a break that a person does not see, diagonals of an image
 _SURELY_ALIKE = 0.9  # correlation of windows that need not be moved
 
@@ -76,12 +80,12 @@ class SeamQuality:
     least_alike: tuple[int, int] | None = None  # the images whose overlap does so the least
 
     @property
-    def contradicted(self) -> bool:
+    def mostly_unlike(self) -> bool:
         """Whether most of what the images share does not look alike: it may be something else that holds them."""
         return self.alike < _MIN_ALIKE
 
     @property
-    def by_chance(self) -> bool:
+    def no_better_than_chance(self) -> bool:
         """Whether the images are no more alike where they overlap than anywhere else."""
         return self.alike < _CHANCE
 
@@ -91,20 +95,20 @@ class SeamQuality:
         return float(self.broken.mean()) if len(self.broken) else 0.0
 
     @property
-    def fit(self) -> bool:
+    def seams_fit(self) -> bool:
         """Whether both sides of the seams fit, but for a few short stretches."""
         return not self._many(self.misfit, self.misfits)
 
     @property
-    def seen(self) -> bool:
-        """Whether a person sees that seams are broken: a long break, or many."""
+    def broken_at_reference_size(self) -> bool:
+        """Whether a person sees a long break, or many, where images have a diagonal of :data:`DIAGONAL`."""
         return self._many(self.broken, self.breaks)
 
     @property
-    def visible(self) -> bool:
-        """Whether that is seen in the output too: a smaller one shows what is as long as a window."""
+    def broken_in_output(self) -> bool:
+        """Whether a person sees that in the output too: a smaller one shows what is as long as a window."""
         longest = max((one.length for one in self.breaks), default=0.0)
-        return self.seen and (self.spacing >= _STEP or longest > 2 * _HALF)
+        return self.broken_at_reference_size and (self.spacing >= _STEP or longest > 2 * _HALF)
 
     def _many(self, counted: BoolArray, stretches: tuple[SeamBreak, ...]) -> bool:
         longest = stretches[0].length if stretches else 0.0
@@ -195,7 +199,7 @@ def _border_places(labels: NDArray[np.int32], label_size: float) -> tuple[IntArr
 
 
 def _searchable(inside: BoolArray) -> dict[int, BoolArray]:
-    """Where windows can be searched for in an image (h, w), by reach."""
+    """Mark where windows can be searched for in an image (h, w), by reach."""
     kernels = {reach: np.ones((2 * (_HALF + reach) + 1,) * 2, np.uint8) for reach in _REACHES}
     opaque, outside = inside.astype(np.uint8), cv2.BORDER_CONSTANT
     return {reach: cv2.erode(opaque, k, borderType=outside, borderValue=(0,)) > 0 for reach, k in kernels.items()}
@@ -211,7 +215,7 @@ class _Verdict(NamedTuple):
 def _comparable_places(
     first: tuple[SeamTile, dict[int, BoolArray]], second: tuple[SeamTile, dict[int, BoolArray]], at: FloatArray
 ) -> tuple[FloatArray, IntArray]:
-    """Those of the places (N, 2) of one border where windows fit into both tiles, and how far they can be searched."""
+    """Select places (N, 2) of a border where windows fit into both tiles; gives also how far they can be searched."""
     whole, reaches = np.rint(at).astype(np.intp), np.zeros(len(at), dtype=np.intp)
     (tile1, areas1), (tile2, areas2) = first, second
     for reach in _REACHES:
@@ -227,7 +231,7 @@ def _verdicts(
     near_border: Callable[[IntArray], BoolArray],
     contrast: float,
 ) -> Iterator[_Verdict | None]:
-    """Of each place (N, 2), pixels; None where neither image has texture."""
+    """Judge each place (N, 2), pixels; None where neither image has texture."""
     if not len(at):
         return
     windows1, windows2, near = _windows(first, at), _windows(second, at), near_border(at)

@@ -23,10 +23,10 @@ _OPAQUE_FROM = 128  # alpha
 _NEGLIGIBLE_SHRINK = 1.05  # an image that gets smaller by less than this keeps its pixels as they are
 # Pixels read for one of the output, at least: a Gaussian needs nearly two to smooth them.
 _PIXELS_PER_OUTPUT_PIXEL = 1.9
-_MAX_PREVIEW = 8  # largest reduction at which previews are read, a power of two
+_SMALLEST = 8  # largest reduction at which images are read
 
-ImageLoader = Callable[[], DecodedImage]
-Preview = Callable[[int], DecodedImage]
+ImageLoader = Callable[[int], DecodedImage]
+"""Reads an image reduced by a factor, of which large ones are quicker; see :func:`rdstitch.io.read_image`."""
 
 Displacement = Callable[[FloatArray], FloatArray]
 """Displacement of an image's content, pixels (..., 2), at measured pixels (..., 2): what local alignment found."""
@@ -36,11 +36,9 @@ Displacement = Callable[[FloatArray], FloatArray]
 class PlacedImage:
     """An image and its place."""
 
-    # reads it (:func:`rdstitch.io.read_image`); called in other threads, before its tiles come, and perhaps again
-    read: ImageLoader
+    read: ImageLoader  # called in other threads, before its tiles come, and perhaps again
     camera: Camera
     homography: FloatArray  # (3, 3): normalized undistorted coordinates to plane coordinates, or to directions
-    preview: Preview | None = None  # reads it reduced by a factor, which is quicker; see :func:`rdstitch.io.read_image`
     # as the camera wrote it down (time x sensitivity / f-number²), up to a factor common to all images
     exposure: float | None = None
     # what local alignment adds to its measured pixels; see :class:`rdstitch.compositing.warp.Warp`
@@ -167,7 +165,7 @@ class ImageReader:
 
     def prepared_twice(self, index: int, shrink: float, finer: float) -> tuple[LoadedImage, LoadedImage]:
         """Read image ``index`` once for two outputs, of which the second shrinks it less."""
-        reduction = self._reduction(index, finer)
+        reduction = _reading_reduction(finer)
         image = self(index, reduction)
         coarse = prepare_image(image, shrink, reduction)
         return coarse, coarse if finer == shrink else prepare_image(image, finer, reduction)
@@ -175,18 +173,14 @@ class ImageReader:
     def nbytes(self, index: int, shrink: float) -> int:
         """Memory that image ``index`` takes at most when it is prepared for such an output, if it was read before."""
         channels, dtype = self.samples
-        width, height = reduced_size(self._images[index].camera.image_size, self._reduction(index, shrink))
+        width, height = reduced_size(self._images[index].camera.image_size, _reading_reduction(shrink))
         opacity = OPACITY_BYTES if self._masked.get(index, False) else 0
         return width * height * (channels * dtype.itemsize + opacity)
-
-    def _reduction(self, index: int, shrink: float) -> int:
-        """What an image is read smaller by for an output that shrinks it so much; a Gaussian does the rest."""
-        return 1 if self._images[index].preview is None else fitting_reduction(shrink / _PIXELS_PER_OUTPUT_PIXEL)
 
     def __call__(self, index: int, reduction: int = 1) -> DecodedImage:
         """Read image ``index``; a grey image among coloured ones becomes coloured."""
         placed = self._images[index]
-        image = placed.preview(reduction) if reduction > 1 and placed.preview is not None else placed.read()
+        image = placed.read(reduction)
         height, width = image.pixels.shape[:2]
         wanted = reduced_size(placed.camera.image_size, reduction)
         if (width, height) != wanted:
@@ -211,20 +205,22 @@ class ImageReader:
     def masked(self, index: int) -> bool:
         """Whether an image has transparent parts; reads it when that is not known yet."""
         if index not in self._masked:
-            self._read_small(index)
+            self(index, _SMALLEST)
         return self._masked[index]
-
-    def _read_small(self, index: int) -> None:
-        self(index, 1 if self._images[index].preview is None else _MAX_PREVIEW)
 
     @property
     def samples(self) -> tuple[int, np.dtype[Any]]:
         """Number of channels and type of all images' samples; reads the first one when none has been read."""
         if self._samples is None:
-            self._read_small(0)
+            self(0, _SMALLEST)
         assert self._samples is not None
         channels, dtype, _ = self._samples
         return (channels[0] if channels else 1), dtype
+
+
+def _reading_reduction(shrink: float) -> int:
+    """What an image is read smaller by for an output that shrinks it so much; a Gaussian does the rest."""
+    return fitting_reduction(shrink / _PIXELS_PER_OUTPUT_PIXEL)
 
 
 def _kind(channels: tuple[int, ...], dtype: np.dtype[Any]) -> str:

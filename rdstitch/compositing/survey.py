@@ -20,8 +20,8 @@ from rdstitch.compositing.source_images import ImageReader, LoadedImage, PlacedI
 from rdstitch.compositing.warp import Warp, locate, plan_warps
 from rdstitch.io.reduction import mean_of_channels
 
-_MAX_IMAGE = 200_000
-_MAX_TOTAL = 16_000_000  # pixels of one image and of all on the reduced canvas; OpenCV finds seams at 100,000
+_MAX_IMAGE = 200_000  # pixels of one image on the reduced canvas; OpenCV finds seams at 100,000
+_MAX_TOTAL = 16_000_000  # pixels of all images there
 _MAX_SEEN = 24_000_000  # pixels of all images where their seams are looked at
 
 

@@ -17,16 +17,21 @@ from numpy.typing import NDArray
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.features.prepared_image import PreparedImage
 
-_CORNERS, _QUALITY, _SPACING = 200, 0.005, 0.02  # the spacing is in sides of the image
+_CORNERS = 200
+_QUALITY = 0.005  # of the strongest corner, that others must have
+_SPACING = 0.02  # sides of the image, between corners
 _TILES = 4, 3  # that corners are spread over: a vehicle's body has the strongest, and one place of a floor another
-_WINDOW, _LEVELS = (15, 15), 3
+_WINDOW = 15, 15  # pixels
+_LEVELS = 3  # of the pyramid, beside the image itself
 _MARGIN = 8.0  # pixels, half a window
 _EXPECTED_LEVELS = 1  # where the expected motion has been taken out
 _NODES = 9  # a side, by which an expected motion is interpolated
 _SAME_LIGHT = 0.05  # change of brightness and contrast up to which they count as constant
-_STILL, _MOVED = 0.5, 3.0  # pixels: what stays in the image, such as a robot's body, and what moves with the ground
+_STILL = 0.5  # pixels that a corner moves at most which stays in the image, such as those of a robot's body
+_MOVED = 3.0  # pixels that a corner moves at least which moves with the ground
 _SEEN_TO_MOVE = 15  # corners that move, where those that do not are none of the ground
-_PLACES, _SURE = 32, 3  # a side, that are told apart, and still corners more than moving ones that make one static
+_PLACES = 32  # a side, that are told apart
+_SURE = 3  # still corners more than moving ones, that make a place static
 _MIN_TRACKED = 0.3  # of the corners, below which they no longer stand for the keyframe
 
 

@@ -12,7 +12,8 @@ _CLEARANCE = 5.0  # pixels from what is masked
 _MOST = 4000  # the strongest
 _MIN_STRENGTH = 0.02  # of the strongest of the image: it has a seventh of the contrast
 _MIN_BALANCE = 0.1  # of the larger curvature that the smaller one has: edges have less
-_STEPS, _FARTHEST = 5, 1.5  # of Newton's method, and pixels that it may lead in all
+_STEPS = 5  # of Newton's method
+_FARTHEST = 1.5  # pixels that it may lead in all
 _FLAT = 1e-6  # grey levels² per pixel⁴: a product of curvatures that is none
 
 

@@ -73,7 +73,7 @@ def detect(image: PixelArray, options: FeatureOptions | None = None, mask: Mask 
 
 
 def detect_view(load: ViewLoader, options: FeatureOptions) -> Features:
-    """As :func:`detect`, for an image that is loaded as large as it is needed."""
+    """Detect and describe the features of an image that is loaded as large as it is needed; see :func:`detect`."""
     most, megapixels = options.limits
     image, detection, usable = _find(load, options, megapixels)
     detected_count, few = len(usable), len(usable) < _MIN_KEYPOINT_FRACTION * most

@@ -108,7 +108,7 @@ class PackedFeatures:
         return cls(bare, _smallest(features.descriptors), features.binary)
 
     def take(self, index: NDArray[np.intp]) -> Self:
-        """Those of the given indices, in their order."""
+        """The features of the given indices, in their order."""
         return replace(self, features=self.features.take(index), descriptors=self.descriptors[index])
 
     def unpack(self) -> Features:

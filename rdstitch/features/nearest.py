@@ -193,7 +193,7 @@ def _rivals(nearest: NDArray[np.intp], best: NDArray[np.float32]) -> NDArray[np.
 
 
 def _merge(block: NDArray[np.float32], layers: list[NDArray[np.intp]], two: Locations) -> NDArray[np.float32]:
-    """From keypoints x keypoints to locations x locations, in place; returns the part that is the result."""
+    """Reduce keypoints x keypoints to locations x locations, in place; returns the part that is the result."""
     top = block[: len(layers[0])]
     offset = len(top)
     for layer in layers[1:]:

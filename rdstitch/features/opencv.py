@@ -1,7 +1,6 @@
 """The detectors that OpenCV brings, in the steps that all detectors take: find, choose, describe."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any, cast
 
@@ -32,8 +31,7 @@ _SCRATCH_OF_A_PIXEL = 230
 
 def detect_opencv(grey: Grey, options: FeatureOptions, octaves: Sequence[int] | None = None) -> Detection:
     """Find keypoints, all or those of some octaves as OpenCV packs them; see :func:`create_detector` for errors."""
-    kind = _KINDS[options.kind]
-    detector = create_detector(options)
+    detector, of_sift = create_detector(options), options.kind in ("sift", "rootsift")
     with scratch_memory(_SCRATCH_OF_A_PIXEL * grey.size):
         keypoints = detector.detect(grey, None) if min(grey.shape) >= _MIN_IMAGE else ()
     table = _table(keypoints, "size", "angle", "octave", "response")
@@ -55,16 +53,16 @@ def detect_opencv(grey: Grey, options: FeatureOptions, octaves: Sequence[int] | 
         points, (size, degrees, response) = table[:, :2].copy(), table[:, 2:].T
         return Features(
             points=points,
-            descriptors=to_rootsift(descriptors) if kind.rooted else cast(Descriptors, descriptors),
+            descriptors=to_rootsift(descriptors) if options.kind == "rootsift" else cast(Descriptors, descriptors),
             scale=size,
             # OpenCV marks "no orientation" by -1.
             angle=np.where(degrees < 0, 0.0, np.radians(degrees) % (2 * np.pi)),
-            response=kind.strength(response, size),
-            laplacian_sign=_laplacian_sign(grey, points, size) if kind.of_blobs else None,
+            response=_strength(response, size, of_sift=of_sift),
+            laplacian_sign=_laplacian_sign(grey, points, size) if of_sift else None,
             kind=options.kind,
         )
 
-    return Detection(table[:, :2], table[:, 2], kind.strength(table[:, 5], table[:, 2]), describe)
+    return Detection(table[:, :2], table[:, 2], _strength(table[:, 5], table[:, 2], of_sift=of_sift), describe)
 
 
 def _laplacian_sign(grey: Grey, points: FloatArray, size: FloatArray) -> NDArray[np.int8]:
@@ -99,7 +97,7 @@ def _table(keypoints: Sequence[cv2.KeyPoint], *names: str) -> FloatArray:
 def create_detector(options: FeatureOptions) -> Any:
     """Make the OpenCV detector of a kind of features."""
     try:
-        return _KINDS[options.kind].create(options)
+        return _CREATORS[options.kind](options)
     except (AttributeError, cv2.error) as error:
         raise ArgumentError(
             f"features {options.kind!r} are not in this OpenCV ({cv2.__version__}); choose others"
@@ -122,28 +120,11 @@ def _akaze(options: FeatureOptions) -> Any:
     return namespace.AKAZE_create(threshold=_AKAZE_THRESHOLD)
 
 
-@dataclass(frozen=True)
-class _Kind:
-    """What differs between OpenCV's detectors."""
-
-    create: Callable[[FeatureOptions], Any]
-    of_blobs: bool = False  # dark or light ones, by differences of Gaussians
-    rooted: bool = False  # descriptors, see :func:`to_rootsift`
-
-    def strength(self, response: FloatArray, size: FloatArray) -> FloatArray:
-        """Strengths by which keypoints are chosen.
-
-        For SIFT contrast times size: by contrast alone the choice is mostly tiny ones, which drown in noise. On real
-        pairs of images the product gives a fifth to a half more inliers, among other detectors it does not help.
-        """
-        return response * size if self.of_blobs else response
-
-
-_KINDS: dict[FeatureName, _Kind] = {
-    "sift": _Kind(_sift, of_blobs=True),
-    "rootsift": _Kind(_sift, of_blobs=True, rooted=True),
-    "orb": _Kind(_orb),
-    "akaze": _Kind(_akaze),
+_CREATORS: dict[FeatureName, Callable[[FeatureOptions], Any]] = {
+    "sift": _sift,
+    "rootsift": _sift,
+    "orb": _orb,
+    "akaze": _akaze,
 }
 
 
@@ -156,3 +137,12 @@ def to_rootsift(descriptors: Descriptors) -> NDArray[np.float32]:
     total = np.maximum(values.sum(axis=1, keepdims=True), np.float32(1.0))
     rooted: NDArray[np.float32] = np.rint(np.sqrt(values / total) * np.float32(_ROOTSIFT_NORM))
     return rooted
+
+
+def _strength(response: FloatArray, size: FloatArray, *, of_sift: bool) -> FloatArray:
+    """Strengths by which keypoints are chosen.
+
+    For SIFT contrast times size: by contrast alone the choice is mostly tiny ones, which drown in noise. On real pairs
+    of images the product gives a fifth to a half more inliers, among other detectors it does not help.
+    """
+    return response * size if of_sift else response

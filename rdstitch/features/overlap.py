@@ -9,11 +9,13 @@ from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Correspondences, Features
 from rdstitch.features.match import Matcher
 
-_MIN_MATCHES, _MAX_MATCHES = 50, 300  # matches that an overlap takes at least, and that are used at most
+_MIN_MATCHES = 50  # that an overlap takes
+_MAX_MATCHES = 300  # that are used
 _SUPPORTING_NEIGHBOURS = 6  # other matches that a right one has near it, in both images
 _NEIGHBOURHOOD = 0.2  # how near, diagonals of an image
-_STRAY = 8  # matches without such company that chance explains; more may be of a part with little texture
-_MIN_REACH, _REACH = 0.12, 2.0  # how far an overlap goes on beside a match: diagonals, times the way to its company
+_MAX_UNSUPPORTED = 8  # matches without them that chance explains; more may be of a part with little texture
+_MIN_REACH = 0.12  # diagonals that an overlap goes on beside a match, at least
+_REACH = 2.0  # times the distance to its supporting neighbours, that it goes on
 _CELLS = 24  # a side, by which places are distinguished
 
 Part = NDArray[np.intp]
@@ -31,12 +33,12 @@ def overlapping(features1: Features, features2: Features, matches: Correspondenc
         return None
     points1, points2 = matches.points1[:_MAX_MATCHES], matches.points2[:_MAX_MATCHES]
     distances = np.maximum(_squared_distances(points1, size1), _squared_distances(points2, size2))
-    # Each is the first in its own company.
-    company = np.sqrt(np.partition(distances, _SUPPORTING_NEIGHBOURS, axis=1)[:, _SUPPORTING_NEIGHBOURS])
-    right = company <= _NEIGHBOURHOOD
-    if np.count_nonzero(~right) > _STRAY:
+    # Each is the first of its own neighbours.
+    farthest = np.sqrt(np.partition(distances, _SUPPORTING_NEIGHBOURS, axis=1)[:, _SUPPORTING_NEIGHBOURS])
+    right = farthest <= _NEIGHBOURHOOD
+    if np.count_nonzero(~right) > _MAX_UNSUPPORTED:
         return None
-    reach = np.maximum(_MIN_REACH, _REACH * company[right])
+    reach = np.maximum(_MIN_REACH, _REACH * farthest[right])
     return _around(features1, size1, points1[right], reach), _around(features2, size2, points2[right], reach)
 
 

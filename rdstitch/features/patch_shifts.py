@@ -16,7 +16,7 @@ Edges = NDArray[np.float32]
 
 
 def edges_of(pixels: NDArray[Any]) -> Edges:
-    """Where the contrast of an image (h, w) or (h, w, C) is strong, whatever its sign."""
+    """Mark where the contrast of an image (h, w) or (h, w, C) is strong, whatever its sign."""
     grey = pixels.astype(np.float32) if pixels.ndim == 2 else pixels[..., :3].mean(axis=2, dtype=np.float32)
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)
     steep = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
@@ -27,14 +27,14 @@ def edges_of(pixels: NDArray[Any]) -> Edges:
 
 
 def _shift(first: Edges, second: Edges) -> FloatArray:
-    """By how many pixels (x, y) the second shows the same further right and down."""
+    """Measure how many pixels (x, y) further right and down the second shows the same."""
     window = cv2.createHanningWindow((first.shape[1], first.shape[0]), cv2.CV_32F)
     (x, y), _ = cv2.phaseCorrelate(first - first.mean(), second - second.mean(), window)
     return np.array([x, y])
 
 
 def coarse_shift(first: Edges, second: Edges) -> FloatArray:
-    """By how many pixels (x, y) the second image shows the same further right and down, as both do made small."""
+    """Measure how many pixels (x, y) further right and down the second image shows the same, by both made small."""
     factor = min(1.0, _COARSE_SIDE / max(first.shape))
     size = round(first.shape[1] * factor), round(first.shape[0] * factor)
     small = [cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (first, second)]

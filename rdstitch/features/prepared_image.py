@@ -157,7 +157,7 @@ def usual_stretch(view: View) -> Stretch | None:
 
 
 def common_stretch(usual: Iterable[Stretch | None]) -> Stretch | None:
-    """One for all images of a set; a tenth of them may be darker, or brighter, than the rest."""
+    """The stretch for all images of a set; a tenth of them may be darker, or brighter, than the rest."""
     stretches = np.array([stretch for stretch in usual if stretch is not None])
     if not len(stretches):
         return None

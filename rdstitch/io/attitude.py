@@ -4,7 +4,7 @@ All of them give yaw, pitch and roll of a body, ``Rz(yaw) Ry(pitch) Rx(roll)`` f
 north, east, down. What differs is where the camera looks in it:
 
 ============= ===================================== ============================================ =================
-source        properties                            the camera looks                             straight down
+convention    properties                            the camera looks                             straight down
 ============= ===================================== ============================================ =================
 dji-gimbal    GimbalYawDegree, GimbalPitchDegree, … ahead                                        pitch -90
 parrot-camera CameraYawDegree, CameraPitchDegree, … ahead                                        pitch -90
@@ -19,14 +19,23 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 _MAX_LENGTH = 2**20  # characters; drones write 2,000 to 20,000
 _MAX_NUMBER_LENGTH = 64  # characters of a number, and of the space around it
-_PROPERTIES = {
-    "dji-gimbal": ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"),
-    "parrot-camera": ("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree"),
-    "pix4d-camera": ("Camera:Yaw", "Camera:Pitch", "Camera:Roll"),
+
+
+class Convention(NamedTuple):
+    """What a maker's numbers mean."""
+
+    properties: tuple[str, str, str]  # of XMP: yaw, pitch, roll
+    looks: Literal["ahead", "below"]  # the axis of the body along which the camera looks
+
+
+CONVENTIONS = {
+    "dji-gimbal": Convention(("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"), "ahead"),
+    "parrot-camera": Convention(("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree"), "ahead"),
+    "pix4d-camera": Convention(("Camera:Yaw", "Camera:Pitch", "Camera:Roll"), "below"),
 }
 
 
@@ -56,12 +65,12 @@ def finite(value: Any) -> float | None:
 
 @dataclass(frozen=True)
 class Attitude:
-    """Attitude as the drone wrote it, degrees; ``source`` is the convention, see above."""
+    """Attitude as the drone wrote it, degrees."""
 
     yaw: float
     pitch: float
     roll: float
-    source: str
+    convention: Convention
 
     @property
     def nadir(self) -> tuple[float, float, float]:
@@ -70,13 +79,13 @@ class Attitude:
         # Down in the body's axes: the last row of Rz(yaw) Ry(pitch) Rx(roll), in which yaw is no matter.
         ahead = -math.sin(pitch)
         right, below = math.cos(pitch) * math.sin(roll), math.cos(pitch) * math.cos(roll)
-        return (right, -ahead, below) if self.source == "pix4d-camera" else (right, below, ahead)
+        return (right, -ahead, below) if self.convention.looks == "below" else (right, below, ahead)
 
 
 def read_attitude(xmp: str) -> Attitude | None:
     """The camera's attitude in an XMP block, or None where it is absent, incomplete or no number."""
-    for source, names in _PROPERTIES.items():
-        yaw, pitch, roll = (xmp_number(xmp, name) for name in names)
+    for convention in CONVENTIONS.values():
+        yaw, pitch, roll = (xmp_number(xmp, name) for name in convention.properties)
         if yaw is not None and pitch is not None and roll is not None:
-            return Attitude(yaw, pitch, roll, source)
+            return Attitude(yaw, pitch, roll, convention)
     return None

@@ -16,14 +16,13 @@ from rdstitch.geometry.camera import is_focal_length
 from rdstitch.geometry.places import GpsPosition
 from rdstitch.io.attitude import finite, xmp_number
 
-ORIENTATION, PIXEL_WIDTH, PIXEL_HEIGHT = 0x0112, 0xA002, 0xA003
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _EXPOSURE_TAGS = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
-# How far, as a logarithm, twice the distance of a calibrated middle from the border may be from the width; and how many
-# times as long one tag's focal length may be as another's: crops for video, and what "35 mm equivalent" is taken for.
-_BESIDE, _CONTRADICTION = 0.05, 1.25
-_MAKER_NOTE = 0x927C
+# A calibrated principal point within so much (log) of the middle of the stored width belongs to that width.
+_MAX_OFF_MIDDLE = 0.05
+# How many times as long one tag's focal length may be as another's: crops for video, and what "35 mm equivalent" means.
+_MAX_CONTRADICTION = 1.25
 _UNWRITABLE = (ValueError, TypeError, LookupError, ArithmeticError, AttributeError, struct.error)
 _TIMES = {int(getattr(ExifTags.Base, name)) for name in ("DateTimeOriginal", "OffsetTimeOriginal")}
 _AUTHOR_TAGS = {
@@ -63,16 +62,16 @@ def focal_length(photo: Mapping[int, Any], xmp: str, size: tuple[int, int]) -> f
     resolution = finite(photo.get(ExifTags.Base.FocalPlaneXResolution))
     unit = _MM_PER_RESOLUTION_UNIT.get(photo.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
     equivalent = finite(photo.get(ExifTags.Base.FocalLengthIn35mmFilm))
-    # Pixels of the original, which a resized image keeps the tags of; it is not read of a middle that is beside it.
-    width = finite(photo.get(PIXEL_WIDTH)) or size[0]
-    calibrated_width = width if not middle or abs(math.log(2.0 * middle / width)) < _BESIDE else 2.0 * middle
+    # Pixels of the original, which a resized image keeps the tags of.
+    width = finite(photo.get(ExifTags.Base.ExifImageWidth)) or size[0]
+    calibrated_width = width if not middle or abs(math.log(2.0 * middle / width)) < _MAX_OFF_MIDDLE else 2.0 * middle
     lengths = [
         calibrated * size[0] / calibrated_width if calibrated else None,
         focal * resolution / unit * size[0] / width if focal and resolution and unit else None,
         equivalent / _DIAGONAL_35MM * math.hypot(*size) if equivalent else None,
     ]
     known = [value for value in lengths if value and value > 0.0 and is_focal_length(value, size)]
-    return known[0] if known and max(known) <= _CONTRADICTION * min(known) else None
+    return known[0] if known and max(known) <= _MAX_CONTRADICTION * min(known) else None
 
 
 def time_taken(photo: Mapping[int, Any]) -> float | None:
@@ -127,15 +126,15 @@ def upright_exif(exif: Image.Exif, width: int) -> bytes:
 
     def clean(kept: Image.Exif) -> None:
         photo = kept.get_ifd(ExifTags.IFD.Exif)
-        original = finite(photo.get(PIXEL_WIDTH))
+        original = finite(photo.get(ExifTags.Base.ExifImageWidth))
         for tag in (ExifTags.Base.FocalPlaneXResolution, ExifTags.Base.FocalPlaneYResolution):
             if original and (resolution := finite(photo.get(tag))) and original != width:
                 photo[tag] = resolution * width / original
-        for gone in (PIXEL_WIDTH, PIXEL_HEIGHT, _MAKER_NOTE):
+        for gone in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight, ExifTags.Base.MakerNote):
             photo.pop(gone, None)
 
     # First, since what is not of the type that belongs to it cannot be written.
-    exif[ORIENTATION] = 1
+    exif[ExifTags.Base.Orientation] = 1
     try:
         data = exif.tobytes()
     except _UNWRITABLE:
@@ -144,7 +143,7 @@ def upright_exif(exif: Image.Exif, width: int) -> bytes:
 
 
 def without_film_size(data: bytes) -> bytes:
-    """EXIF of an image that was cut or extended: of what film it would be that of is not true."""
+    """EXIF of an image that was cut or extended, without a focal length for 35 mm film, which is no longer true."""
     film = ExifTags.Base.FocalLengthIn35mmFilm
     return _edited(data, lambda exif: exif.get_ifd(ExifTags.IFD.Exif).pop(film, None))
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.io.read import DecodedImage, Pixels
 
-_NODES, _MAX_STEP = 320, 8  # along the width, and pixels between them, at which the displacement is computed
+_NODES = 320  # along the width, at which the displacement is computed
+_MAX_STEP = 8  # pixels between nodes
 _ROWS = 512  # that are resampled at a time
 _CHANNELS = 4  # that OpenCV resamples at once
 

@@ -14,7 +14,6 @@ from rdstitch.geometry.places import GpsPosition
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_text
 from rdstitch.io.colour import ink_transform
 from rdstitch.io.exif import (
-    ORIENTATION,
     author_and_time,
     exposure_of,
     focal_length,
@@ -42,7 +41,6 @@ from rdstitch.io.read_tiff import channel_count, first_image_pages
 from rdstitch.system.file_access import open_regular
 from rdstitch.system.late_imports import tifffile
 
-_BLACK_LEVEL = 50714
 _MAX_DPI = 1e6
 
 MAX_PROFILE = 2**20 - 2**10
@@ -52,7 +50,6 @@ _EXIF_OF_PNG = {"exif", "Raw profile type exif"}
 GREY_16 = ("I;16", "I;16B", "I;16L", "I;16N", "I")  # modes of Pillow's
 _COLOUR_SPACE = slice(16, 20)  # of a profile's header
 _HEADER = 16
-_XMP, _PROFILE, _RESOLUTION, _RESOLUTION_UNIT = 700, 34675, (282, 283), 296
 _INCHES = {2: 1.0, 3: 2.54}  # what pixels per unit are multiplied by
 
 
@@ -102,11 +99,11 @@ class Metadata:
         return self.dpi if self.dpi is not None and all(0.0 < each < _MAX_DPI for each in self.dpi) else None
 
     def in_another_size(self) -> Self:
-        """Of the same image at the same scale but cut or extended."""
+        """Metadata of the same image at the same scale but cut or extended."""
         return replace(self, exif=without_film_size(self.exif))
 
     def of_composite(self) -> Self:
-        """Of an image made from several."""
+        """Metadata of an image made from several."""
         return replace(self, exif=author_and_time(self.exif))
 
 
@@ -141,10 +138,12 @@ def _tiff_metadata(file: Path, stream: BinaryIO) -> Metadata:
         tags.bigtiff, tags.endian = tiff.is_bigtiff, tiff.byteorder
         tags.load_from_fp(stream, page.offset)
         exif = own_exif(tags)
-    exif[ORIENTATION] = tags.get(ORIENTATION, 1)
-    info = {"icc_profile": tags.get(_PROFILE), "xmp": tags.get(_XMP), "black_level": tags.get(_BLACK_LEVEL)}
-    if (per := _INCHES.get(tags.get(_RESOLUTION_UNIT, 2))) and tags.get(_RESOLUTION[0]):
-        info["dpi"] = tuple((finite(tags.get(tag)) or math.nan) * per for tag in _RESOLUTION)
+    exif[ExifTags.Base.Orientation] = tags.get(ExifTags.Base.Orientation, 1)
+    tag = ExifTags.Base
+    info = {"icc_profile": tags.get(tag.InterColorProfile), "xmp": tags.get(tag.XMLPacket)}
+    info["black_level"] = tags.get(tag.BlackLevel)
+    if (per := _INCHES.get(tags.get(tag.ResolutionUnit, 2))) and tags.get(tag.XResolution):
+        info["dpi"] = tuple((finite(tags.get(along)) or math.nan) * per for along in (tag.XResolution, tag.YResolution))
     metadata = _metadata(exif, info, size, page.bitspersample, channels)
     return replace(metadata, pixel_size=None if ome is None else ome.pixel_size, planes=planes)
 
@@ -171,7 +170,7 @@ def _metadata(
     exif: Image.Exif, info: Mapping[Any, Any], size: tuple[int, int], bit_depth: int, channels: int
 ) -> Metadata:
     """Metadata by EXIF and by what Pillow calls the info of an image whose pixels are stored in a size."""
-    orientation = orientation_of(exif.get(ORIENTATION))
+    orientation = orientation_of(exif.get(ExifTags.Base.Orientation))
     photo = exif.get_ifd(ExifTags.IFD.Exif)
     xmp = xmp_text(info)
     gps, gps_problem = gps_position(exif.get_ifd(ExifTags.IFD.GPSInfo), xmp)

@@ -73,7 +73,8 @@ _MAX_MAGIC = max(map(len, _FORMATS))
 _NAMES = "JPEG, PNG, TIFF, WebP, AVIF, HEIC, BMP, TGA, GIF, JPEG 2000, PBM, PGM, PPM"
 MAX_IMAGE_GB = "RDSTITCH_MAX_IMAGE_GB"
 """The environment's name of what one decoded image may take at the most, 1e9 bytes."""
-_MIN_LIMIT, _MEMORY_FRACTION = 178e6 * 3, 1 / 8
+_MIN_LIMIT = 178e6 * 3  # bytes of a decoded image, where the environment does not say
+_MEMORY_FRACTION = 1 / 8  # of the machine's memory, which is the limit where it is more
 _PNG_METADATA = (b"eXIf", b"tEXt", b"zTXt", b"iTXt")
 
 

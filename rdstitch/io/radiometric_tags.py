@@ -19,7 +19,7 @@ _GAINS = (1.0, 25.0, 428.0, 9876.0)  # of its sensor, ams TSL2591
 
 @dataclass(frozen=True)
 class Radiometry:
-    """Of one image whose samples are measurements of light."""
+    """What turns the samples of an image into measurements of light."""
 
     black: float = 0.0  # the sample of no light, share of the full range
     irradiance: float | None = None  # up to a factor that all images of the camera share
@@ -27,7 +27,7 @@ class Radiometry:
 
 
 def read_radiometry(xmp: str, black_level: Any, bit_depth: int) -> Radiometry | None:
-    """By XMP and TIFF's BlackLevel; None of an image that is no band of a multispectral camera."""
+    """Darkness and irradiance by XMP and TIFF's BlackLevel; None for what is no band of a multispectral camera."""
     levels = black_level if isinstance(black_level, tuple) else (black_level,)
     known = [level for level in map(finite, levels) if level is not None and level >= 0.0]
     if not known and _BAND.search(xmp) is None:

@@ -130,7 +130,7 @@ def _is_padding(complaint: str, data: bytes) -> bool:
 
 
 def _decoder_reduction(image: Image.Image, metadata: Metadata, reduction: int) -> int:
-    """By how much of a reduction the decoder can make the image smaller; 1 for nothing."""
+    """The part of a reduction by which the decoder can make the image smaller; 1 for nothing."""
     factor = math.gcd(reduction, _MAX_DECODED_REDUCTION)
     # Blocks begin at the stored image's first pixel; in one that is to be mirrored they must end at its last.
     crosswise = metadata.orientation != 1 and any(n % factor for n in image.size)

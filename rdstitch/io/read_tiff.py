@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from rdstitch.io.colour import srgb_of_lab, without_inks
 from rdstitch.io.ome import OmeImage, read_ome
@@ -32,7 +32,7 @@ _COLOURS = {
 _INDIRECT = (_PALETTE, _INKS)  # become 8-bit RGB, beside which their other bands say nothing
 _ASSOCIATED, _UNASSOCIATED = 1, 2  # alpha; colours of the first are multiplied by it
 _JPEG = (6, 7, 33007, 34892)  # compressions whose decoders make RGB of YCbCr
-_PROFILE, _NODATA = 34675, 42113
+_NODATA = 42113
 
 
 def image_pages(tiff: "tifffile.TiffFile") -> Iterator["tifffile.TiffPage"]:
@@ -121,7 +121,7 @@ def _by_pillow(page: "tifffile.TiffPage", colours: Pixels, mode: str) -> Pixels:
     if colours.dtype == np.uint16:
         colours = (colours >> 8).astype(np.uint8)
     image = Image.frombytes(mode, colours.shape[1::-1], colours.tobytes())
-    profile = page.tags.get(_PROFILE)
+    profile = page.tags.get(int(ExifTags.Base.InterColorProfile))
     if profile is not None:
         image.info["icc_profile"] = profile.value
     return np.asarray(without_inks(image).convert("RGB"))

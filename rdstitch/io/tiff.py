@@ -32,7 +32,7 @@ _DEFLATE_LEVEL = 1  # of 1 to 12: 2 takes 1.7 times as long and makes files 2 % 
 MIN_OVERVIEW = 256  # pixels along the longer side: smaller images need no overview
 _REDUCED, _MASK = 1, 4  # kinds of pages (NewSubfileType)
 _BIGTIFF_FROM = 2**32 - 2**27
-_XMP, _GDAL_METADATA = 700, 42112
+_GDAL_METADATA = 42112
 _COPIED_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.Artist, ExifTags.Base.Copyright)
 
 # (code, type, count, value, only on the first page), as tifffile takes them.
@@ -173,7 +173,7 @@ def _band_names(spec: ImageSpec) -> Iterator[ExtraTag]:
 def copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:
     """XMP, and tags of the first image's EXIF that stay true of a mosaic."""
     if metadata.xmp:
-        yield _XMP, 1, len(metadata.xmp), metadata.xmp, True
+        yield int(ExifTags.Base.XMLPacket), 1, len(metadata.xmp), metadata.xmp, True
     if metadata.exif:
         exif = Image.Exif()
         exif.load(metadata.exif)

@@ -95,7 +95,7 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
         first = trials.lay_out(registration)
     except LimitError as error:
         too_large = error
-    if first is None or first.seams.contradicted:
+    if first is None or first.seams.mostly_unlike:
         registration, first = _plane_behind(registration, first, trials, aligner)
     tried = [] if first is None else [first]
     for other in _alternatives(registration, first, trials, aligner):
@@ -106,7 +106,7 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
     if too_large is not None and not tried:
         raise too_large
     best = _least_broken(tried, keep_first=first is not None)
-    if best.seams.by_chance and not options.force:
+    if best.seams.no_better_than_chance and not options.force:
         raise RefusedError(best.registration.with_messages([_BY_CHANCE]))
     return best
 
@@ -178,7 +178,7 @@ def _least_broken(tried: Sequence[CandidateLayout], *, keep_first: bool) -> Cand
     """The layout that the least speaks against; or else the first, unless another is clearly better."""
     first = tried[0]
     best = min((one for one in tried if one.clipped <= first.clipped), key=lambda one: (one.faults, one.broken))
-    broken = 0 if first.seams.fit else first.broken
+    broken = 0 if first.seams.seams_fit else first.broken
     clearly = best.faults < first.faults or best.broken <= _CLEARLY * broken
     return best if clearly or not keep_first else first
 

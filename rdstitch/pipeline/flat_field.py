@@ -29,7 +29,6 @@ def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list
     """The tiles, which are read without the illumination that all have; and what there is to say of that."""
     # Imported late: images that are no tiles have no use for it.
     from rdstitch.stage.estimate_flat_field import FlatFieldUnknown, estimate_illumination
-    from rdstitch.stage.sentences import flat_field_estimated
 
     if wanted == "off":
         return list(sources), []
@@ -44,4 +43,6 @@ def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list
         return list(sources), [Message(text, severity="note", code="flat-field")]
     if shown is FlatFieldUnknown.UNSURE:
         return list(sources), [NO_FLAT_FIELD]
-    return [replace(source, flat_field=shown.field) for source in sources], [flat_field_estimated(shown)]
+    dark = ", ".join("not shown" if d is None else f"{d.level:.0f} ± {d.std:.0f}" for d in shown.dark)
+    text = f"flat field: {shown.shading:.0%} less light where it is darkest, ± {shown.error:.1%}; dark level {dark}"
+    return [replace(source, flat_field=shown.field) for source in sources], [Message(text, severity="note")]

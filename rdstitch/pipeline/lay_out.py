@@ -48,7 +48,7 @@ class CandidateLayout:
         """
         seams = self.seams
         unjudged = bool(self.local.fields) and not len(seams.places)
-        return int(not seams.fit) + int(is_stretched(self.plan)) + int(seams.contradicted) + int(unjudged)
+        return int(not seams.seams_fit) + int(is_stretched(self.plan)) + int(seams.mostly_unlike) + int(unjudged)
 
     @property
     def clipped(self) -> int:

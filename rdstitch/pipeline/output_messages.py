@@ -65,8 +65,8 @@ def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
     """Where seams are broken, a warning where a person sees it, else a detail; of overlaps that are unlike, one warning
     where no seams hold that say otherwise.
     """
-    hold = len(seams.places) and seams.fit
-    if seams.contradicted and not hold and seams.least_alike is not None:
+    hold = len(seams.places) and seams.seams_fit
+    if seams.mostly_unlike and not hold and seams.least_alike is not None:
         images = tuple(paths[k] for k in seams.least_alike)
         text = (
             f"only {seams.alike:.0%} of what the images share looks alike, the least between "
@@ -89,7 +89,7 @@ def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
         f"{'; '.join(breaks)}{more}: something moved, or is nearer than the rest; leave one of the two out, or mask it"
     )
     images = tuple(dict.fromkeys(paths[k] for one in worst for k in one.images))
-    return [Message(text, images, "warning" if seams.visible else "detail", code="seam-break")]
+    return [Message(text, images, "warning" if seams.broken_in_output else "detail", code="seam-break")]
 
 
 def lost_profile_messages(source: Source, output: Path) -> list[Message]:

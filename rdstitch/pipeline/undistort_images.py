@@ -18,7 +18,6 @@ from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Images, as_inputs, to_channel_order
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io.read import DecodedImage
 from rdstitch.io.write import write_image
 from rdstitch.options.option import check_parameter, files_in
 from rdstitch.pipeline.given_camera import read_camera
@@ -129,8 +128,7 @@ def undistort(
 def _undistorted(source: Source, view: Framing) -> Composite:
     plain = CompositeOptions(exposure="none", seam="none", blend="none")
     canvas = undistorted_canvas(source.camera, view)
-    read: Callable[[], DecodedImage] = source.read
-    return compose([PlacedImage(read, source.camera, np.eye(3))], canvas, plain)
+    return compose([PlacedImage(source.read, source.camera, np.eye(3))], canvas, plain)
 
 
 def _files(sources: Sequence[Source], folder: Path, image_format: ImageFormat | None) -> list[Path]:

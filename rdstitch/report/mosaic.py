@@ -69,7 +69,7 @@ def _broken_seams(result: StitchResult) -> str:
     if not len(seams.places):
         return ""
     text = f"{counted(int(seams.broken.sum()), 'place')} of {len(seams.places)} along the seams broken."
-    return element("p", text, class_="bad" if seams.visible else "good")
+    return element("p", text, class_="bad" if seams.broken_in_output else "good")
 
 
 def _thumbnail(result: StitchResult, file: Path | None) -> str | None:

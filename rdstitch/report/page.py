@@ -129,7 +129,7 @@ def summary(registration: Registration, stitched: StitchResult | None) -> str:
     if not registration.ok:
         failures = "; ".join(registration.verdict.failures)
         verdict = element("p", f"Not to be relied on: {failures}", class_="bad")
-    elif stitched is not None and stitched.seams.visible:
+    elif stitched is not None and stitched.seams.broken_in_output:
         verdict = element("p", "Seams are broken; the picture below shows where.", class_="bad")
     else:
         verdict = element("p", "The result passed its own checks.", class_="good")

@@ -102,15 +102,13 @@ class PlacedImages:
 
     def images(self, canvas: Canvas) -> list[PlacedImage]:
         """As the compositor takes them, with only the near parts of those that a canvas does not show whole."""
-        nothing = [None] * len(self.sources)
-        parts, displacements = canvas.near or nothing, self.displacements or nothing
-        images = zip(self.sources, self.homographies, parts, displacements, strict=True)
+        displacements = self.displacements or [None] * len(self.sources)
+        images = zip(self.sources, self.homographies, canvas.near, displacements, strict=True)
         return [
             PlacedImage(
-                read := self._reader(source, part),
+                self._reader(source, part),
                 source.camera,
                 homography,
-                preview=read,
                 exposure=source.metadata.exposure,
                 displacement=displacement,
                 path=str(source.path),

@@ -44,7 +44,7 @@ class StageModel:
 
 @dataclass(frozen=True, eq=False)
 class Adjustment:
-    """All places."""
+    """The places of all tiles, and the model of the stage that they were fitted with."""
 
     places: FloatArray  # (N, 2): of the undistorted tiles, pixels
     distortion: float  # λ in the half-diagonal frame
@@ -122,7 +122,7 @@ def _reweighted(
 def _variances(
     equations: StageEquations, state: StageState, draws: StageState, weights: FloatArray, usual: Variances
 ) -> Variances:
-    """Of tiles, rows, columns and pairs, from those that links hold: the fewer they are, the more counts the usual."""
+    """Variances of tiles, rows, columns and pairs by those that links hold: the fewer, the more ``usual`` counts."""
     agreeing = weights > HOLDING_WEIGHT
 
     def squared(values: FloatArray, errors: FloatArray, chosen: IntArray) -> FloatArray:

@@ -117,7 +117,7 @@ def _perpendicular(x: FloatArray, y: FloatArray) -> bool:
 
 
 def _across(nominal: FloatArray, other: FloatArray, other_measured: FloatArray) -> FloatArray:
-    """A step that no pair shows, by the other one: as long relative to that as nominally, and perpendicular to it."""
+    """Derive a step that no pair shows from the other: perpendicular to that, and as much longer as nominally."""
     longer = float(np.linalg.norm(nominal) / np.linalg.norm(other))
     across = np.array([-other_measured[1], other_measured[0]]) * longer
     # On the side of the nominal one if there is such a side.

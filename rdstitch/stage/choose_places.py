@@ -19,7 +19,7 @@ _ROUNDS = 4  # by which what is certain of the stage decides about what was not
 def choose_places(
     pairs: IntArray, candidates: Sequence[Candidates], plan: SearchPlan, lens: float
 ) -> dict[int, FloatArray]:
-    """Where the second tile of a pair is in the first, by pair, where one place stands out.
+    """Choose where the second tile of each pair is in the first, where one place stands out.
 
     What is certain teaches what the stage does, which decides among the places of the other pairs.
     """

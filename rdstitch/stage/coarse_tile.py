@@ -38,7 +38,7 @@ class CoarseTile:
 
 
 def coarse_tile(tile: NDArray[Any], factor: int) -> CoarseTile:
-    """Blocks of so many pixels a side of a tile (h, w) become one."""
+    """Make a tile (h, w) smaller by a factor, and separate its content from noise and illumination."""
     image = np.asarray(block_mean(tile, factor), dtype=np.float32)
     noise = noise_variance(image)
     side = max(3, round(_ILLUMINATION * max(image.shape)) | 1)

@@ -137,7 +137,7 @@ class _Channel:
 
     @property
     def error(self) -> float:
-        """That of one of the halves: what both have in common, such as the form of the surface, is not seen."""
+        """Error of one of the halves: what both have in common, such as the form of the surface, is not seen."""
         return math.hypot(math.sqrt(2.0) * self.halves_error, self.dark_effect)
 
 

@@ -24,7 +24,10 @@ class Overlap:
 
     @classmethod
     def expected(cls, offset: FloatArray, sizes: IntArray, least: int) -> "Overlap":
-        """Of tiles of sizes (2, 2), width and height, the second at an offset in the first; ``least`` pixels wide."""
+        """The overlap of two tiles, the second at an offset in the first.
+
+        ``sizes`` (2, 2) are their widths and heights; it is ``least`` pixels wide.
+        """
         side = sizes[0]
         whole = np.rint(offset).astype(np.intp)
         low, high = np.maximum(0, whole), np.minimum(side, sizes[1] + whole)

@@ -45,7 +45,7 @@ class SearchPlan:
 
     @classmethod
     def of(cls, grid: TileGrid, search: float | None = None) -> "SearchPlan":
-        """By what the user says of the search, or as usual."""
+        """Plan the search within so many pixels that the user says, or a usual part of a tile."""
         side = max(grid.size)
         return cls(grid, _SEARCH * side if search is None else search, max(1, round(side / _COARSE_SIDE)))
 

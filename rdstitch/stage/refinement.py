@@ -16,7 +16,8 @@ from rdstitch.stage.coarse_tile import CORRELATED, Image
 _SMOOTHING = 1.2  # standard deviation of the filter before derivatives are taken, pixels
 _MARGIN = 5  # pixels of the second tile about a block that are looked at
 _STEP = 8  # pixels between which the lens is straight
-_ITERATIONS, _SETTLED = 5, 0.003  # pixels
+_ITERATIONS = 5
+_SETTLED = 0.003  # pixels that an iteration moves, which is the last one then
 _MIN_SIDE = 12  # pixels of a block
 _SIGNIFICANT = 5.0  # standard deviations by which the correlation of a block must exceed that of noise
 _CORRELATED = CORRELATED * _SMOOTHING**2  # pixels that share their noise after the filter
@@ -82,7 +83,7 @@ class _SampledPair:
 def _sampled_pair(
     first: NDArray[Any], second: NDArray[Any], block: IntArray, transfer: PointMap
 ) -> _SampledPair | None:
-    """As far as both tiles have what the search may need; None where that is too small."""
+    """Sample a block as far as both tiles have what the search may need; None where that is too small."""
     sides = np.array([first.shape[::-1], second.shape[::-1]])
     corners = np.array([block[[0, 1]], block[[2, 1]], block[[0, 3]], block[[2, 3]]], dtype=np.float64)
     off = corners - transfer(corners)

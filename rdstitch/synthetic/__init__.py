@@ -2,8 +2,8 @@
 
 from rdstitch.synthetic.lenses import BrownLens, FisheyeLens, Lens
 from rdstitch.synthetic.poses import Poses, fit_to_plane, grid_poses, pair_poses
-from rdstitch.synthetic.relief import RELIEFS, Relief, hills
-from rdstitch.synthetic.rendering import Photometry, Sequence, sequence_over
+from rdstitch.synthetic.relief import RELIEFS, Relief, buildings, bumps, slopes
+from rdstitch.synthetic.rendering import Photometry, RenderedSequence, sequence_over
 from rdstitch.synthetic.textures import EndlessTexture, ImageTexture, Texture, blank, gradient, ground, repeated
 
 __all__ = [
@@ -16,15 +16,17 @@ __all__ = [
     "Photometry",
     "Poses",
     "Relief",
-    "Sequence",
+    "RenderedSequence",
     "Texture",
     "blank",
+    "buildings",
+    "bumps",
     "fit_to_plane",
     "gradient",
     "grid_poses",
     "ground",
-    "hills",
     "pair_poses",
     "repeated",
     "sequence_over",
+    "slopes",
 ]

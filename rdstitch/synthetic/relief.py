@@ -1,4 +1,4 @@
-"""Ground that is not flat: hills, buildings and ridges of a given height, seen with true visibility."""
+"""Ground that is not flat: bumps, buildings and slopes of a given height, seen with true visibility."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -91,7 +91,7 @@ class Relief:
         return np.asarray(met.reshape(-1, 2)[: foot.size // 2].reshape(foot.shape))
 
 
-def hills(size: tuple[int, int], seed: int, *, height: float, width: int = 200) -> Relief:
+def bumps(size: tuple[int, int], seed: int, *, height: float, width: int = 200) -> Relief:
     """Smooth bumps at random, the highest ``height`` texels above the lowest point, tops about ``width`` apart."""
     # Noise on a coarse grid, enlarged by cubic interpolation: as smooth as hills are, at any size of the plane.
     rng = np.random.default_rng(seed)
@@ -105,7 +105,7 @@ def hills(size: tuple[int, int], seed: int, *, height: float, width: int = 200) 
     return Relief(_scaled(np.asarray(ground, dtype=np.float32), height))
 
 
-def boxes(size: tuple[int, int], seed: int, *, height: float, width: int = 60) -> Relief:
+def buildings(size: tuple[int, int], seed: int, *, height: float, width: int = 60) -> Relief:
     """Flat ground with boxes, between a quarter and the whole of ``height`` high: a town.
 
     Boxes are from a third of ``width`` texels to ``width`` wide, and cover about a third of the ground.
@@ -119,7 +119,7 @@ def boxes(size: tuple[int, int], seed: int, *, height: float, width: int = 60) -
     return Relief(ground)
 
 
-def ridges(size: tuple[int, int], seed: int, *, height: float, width: int = 400) -> Relief:
+def slopes(size: tuple[int, int], seed: int, *, height: float, width: int = 400) -> Relief:
     """Parallel ridges and valleys with straight flanks, ``width`` texels apart, in a random direction."""
     rng = np.random.default_rng(seed)
     direction, phase = rng.uniform(0.0, np.pi), rng.random()
@@ -128,7 +128,7 @@ def ridges(size: tuple[int, int], seed: int, *, height: float, width: int = 400)
     return Relief(_scaled(np.abs(across - np.rint(across)).astype(np.float32), height))
 
 
-RELIEFS: dict[str, Callable[..., Relief]] = {"bumps": hills, "buildings": boxes, "slopes": ridges}
+RELIEFS: dict[str, Callable[..., Relief]] = {"bumps": bumps, "buildings": buildings, "slopes": slopes}
 """Makers of relief by the kind of ground; each takes ``(size, seed, height=...)``."""
 
 

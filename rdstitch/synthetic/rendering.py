@@ -34,23 +34,24 @@ _APRON = 3
 class Photometry:
     """The way from light to an image."""
 
-    gain: float | FloatArray = 1.0  # exposure, one for all images or one an image (N,)
+    gain: float | FloatArray = 1.0  # exposure, one for all images or one an image; kept as (1,) or (N,)
     vignetting: float = 0.0  # share of the light that is missing at the corners; it grows with the square of the radius
     gamma: float = 1.0  # gain and vignetting act on value ** gamma: 1 on the values themselves, 2.2 in linear light
     blur: float = 0.0  # standard deviation of the lens's blur, pixels
-    noise: float = 0.0  # its standard deviation, in units of full range; 0.01 is 2.5 grey levels of 8 bit
+    noise: float = 0.0  # standard deviation of the noise, fraction of full range; 0.01 is 2.5 grey levels of 8 bit
     bits: int = 8  # 8 or 16
 
     def __post_init__(self) -> None:
         if self.bits not in (8, 16):
             raise ArgumentError(f"images have 8 or 16 bits, not {self.bits}")
-        least = np.concatenate([np.ravel(self.gain), [self.blur, self.noise]])
+        object.__setattr__(self, "gain", np.atleast_1d(np.asarray(self.gain, dtype=np.float64)))
+        least = np.array([*np.ravel(self.gain), self.blur, self.noise])
         if not (np.isfinite([*least, self.vignetting, self.gamma]).all() and least.min() >= 0.0 and self.gamma > 0.0):
             raise ArgumentError(f"light must be finite, and no gain, blur or noise below 0, nor gamma 0: {self}")
 
 
 @dataclass(frozen=True)
-class Sequence:
+class RenderedSequence:
     """Images of a plane, rendered on demand, and their ground truth.
 
     The coordinates of the texture, texels, are the plane's, see :mod:`rdstitch.synthetic.poses`; the lens is a
@@ -135,7 +136,9 @@ class Sequence:
             eight_only = image.dtype == np.uint16 and path.suffix.lower() not in _SIXTEEN_BITS
             if eight_only or not cv2.haveImageWriter(path.name):
                 raise OutputError(f"{path}: cannot hold images of {self.photometry.bits} bits; use .png or .tif")
-            _, encoded = cv2.imencode(path.suffix, bgr)
+            encodes, encoded = cv2.imencode(path.suffix, bgr)
+            if not encodes:
+                raise OutputError(f"{path}: OpenCV cannot encode it")
             try:
                 path.write_bytes(encoded.tobytes())
             except OSError as error:
@@ -159,7 +162,7 @@ class Sequence:
         # Blur needs the rows beyond the strip.
         apron = int(np.ceil(4.0 * settings.blur))
         light = self._sharp(index, top - apron, bottom + apron)
-        gain = np.broadcast_to(np.asarray(settings.gain, dtype=np.float64), (len(self),))[index]
+        gain = np.broadcast_to(settings.gain, (len(self),))[index]
         u, v = np.arange(width) - self.lens.center[0], np.arange(top - apron, bottom + apron) - self.lens.center[1]
         radius2 = 4.0 * (u**2 + v[:, None] ** 2) / (width**2 + height**2)
         factor = (gain * np.maximum(1.0 - settings.vignetting * radius2, 0.0)) ** (1.0 / settings.gamma)
@@ -229,12 +232,12 @@ def sequence_over(
     relief: Relief | Callable[[tuple[int, int]], Relief] | None = None,
     seed: int = 0,
     margin: int = 16,
-) -> Sequence:
+) -> RenderedSequence:
     """Images of a plane that is made as large as they need it; the poses may lie anywhere and are moved.
 
     ``plane`` makes the plane for a given size, such as ``lambda size: ground(size, seed=1)``, or is a texture, on which
     the poses are centred. ``relief`` are heights, or what makes them for the size of the plane, such as ``lambda size:
-    hills(size, 1, height=40.0)``. Around what the images show ``margin`` texels are left.
+    bumps(size, 1, height=40.0)``. Around what the images show ``margin`` texels are left.
     """
     moved, size = fit_to_plane(lens, poses, margin)
     settings = Photometry() if photometry is None else photometry
@@ -245,4 +248,4 @@ def sequence_over(
         if (spare < 0).any():
             raise ArgumentError(f"the texture has {plane.size} texels, the images need {size}")
         moved = moved.moved(spare // 2)
-    return Sequence(texture, lens, moved, settings, relief(texture.size) if callable(relief) else relief, seed)
+    return RenderedSequence(texture, lens, moved, settings, relief(texture.size) if callable(relief) else relief, seed)

@@ -20,6 +20,19 @@ LinearPixels = NDArray[np.float32]
 # (Two layers of 2039 and 1787 come within 12 at 14,284, and places so far apart look the same.)
 LAYER_PERIODS = (2063, 1997, 1613)
 _SUBPIXEL_BITS = 4
+_MIN_RADIUS = 2.5  # texels, of patches
+_MAX_RADIUS = 160.0  # texels, where the plane is six times as large
+_KINDS = 0.7, 0.2, 0.1  # fractions of the patches that are polygons, ellipses and streaks
+_IRREGULAR = 0.35  # of the angle between two corners of a polygon, that they stray
+_ELLIPSE_CORNERS = 16
+_FLATNESS = 0.4, 1.0  # ratios of the axes of polygons and ellipses
+_STREAK_LENGTH = 2.5  # times the radius of other patches
+_STREAK_WIDTH = 0.1  # of their length
+_MATERIALS = 9
+_MATERIAL_GREY = 60.0, 190.0  # grey levels of 8 bits, as all that follow
+_TINT = 18.0  # standard deviation of a material's channels
+_PATCH_SPREAD = 28.0  # standard deviation of the patches of a material
+_PATCH_GREY = 20.0, 235.0
 
 
 class Texture(Protocol):
@@ -39,13 +52,13 @@ class Texture(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ImageTexture:
-    """An image as texture: uint8 or uint16 of full range, or float32 in [0, 1], (h, w) or (h, w, 3)."""
+    """An image as texture: uint8 or uint16 of full range, or float32 in [0, 1], (h, w) or (h, w, C)."""
 
     pixels: NDArray[Any]
 
     def __post_init__(self) -> None:
         if self.pixels.ndim not in (2, 3) or self.pixels.size == 0:
-            raise ArgumentError(f"a texture has shape (h, w) or (h, w, 3), not {self.pixels.shape}")
+            raise ArgumentError(f"a texture has shape (h, w) or (h, w, C), not {self.pixels.shape}")
         if self.pixels.dtype not in (np.uint8, np.uint16, np.float32):
             raise ArgumentError(f"a texture is uint8, uint16 or float32, not {self.pixels.dtype}")
 
@@ -56,7 +69,7 @@ class ImageTexture:
 
     @property
     def channels(self) -> int:
-        """1 for grey, 3 for RGB."""
+        """Number of channels; 3 are RGB."""
         return 1 if self.pixels.ndim == 2 else self.pixels.shape[2]
 
     def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
@@ -121,7 +134,7 @@ def repeated(size: tuple[int, int], seed: int, period: int = 96) -> Texture:
     return ImageTexture(np.tile(tile, (rows, columns, 1))[: size[1], : size[0]].copy())
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=len(LAYER_PERIODS))  # 51 MB for the largest of them, in RGB
 def _periodic_ground(period: int, seed: tuple[int, int], channels: int) -> LinearPixels:
     """Ground of ``period`` x ``period`` texels that continues across its borders."""
     rng = np.random.default_rng(seed)
@@ -135,14 +148,14 @@ def _dead_leaves(
 ) -> NDArray[np.uint8]:
     """Overlapping patches that cover the image ``cover`` times; with ``wrap``, also across its borders."""
     width, height = size
-    smallest, largest = 2.5, max(6.0, min(160.0, min(size) / 6.0))
+    smallest, largest = _MIN_RADIUS, max(6.0, min(_MAX_RADIUS, min(size) / 6.0))
     mean_area = np.pi * 2.0 * np.log(largest / smallest) / (smallest**-2 - largest**-2)
     count = int(np.ceil(cover * width * height / mean_area))
     # Inverse of the cumulative distribution of r⁻³.
     radius = 1.0 / np.sqrt(smallest**-2 - rng.random(count) * (smallest**-2 - largest**-2))
     center = rng.random((count, 2)) * size
     colour = _palette(rng, count, channels)
-    places, owner = _wrapped(center, 2.5 * radius, size) if wrap else (center, np.arange(count))
+    places, owner = _wrapped(center, _STREAK_LENGTH * radius, size) if wrap else (center, np.arange(count))
     leaves = _leaf_outlines(rng, radius)
 
     canvas = np.empty((height, width, channels), dtype=np.uint8)
@@ -155,10 +168,10 @@ def _dead_leaves(
 
 
 def _palette(rng: np.random.Generator, count: int, channels: int) -> NDArray[np.float64]:
-    """Colours of patches, grey levels 20-235: a few materials, each with its own spread of brightness."""
-    materials = rng.uniform(60.0, 190.0, (9, 1)) + rng.normal(0.0, 18.0, (9, channels))
-    colour = materials[rng.integers(len(materials), size=count)] + rng.normal(0.0, 28.0, (count, 1))
-    return np.clip(colour, 20.0, 235.0)
+    """Colours of patches: a few materials, each with its own spread of brightness."""
+    materials = rng.uniform(*_MATERIAL_GREY, (_MATERIALS, 1)) + rng.normal(0.0, _TINT, (_MATERIALS, channels))
+    colour = materials[rng.integers(len(materials), size=count)] + rng.normal(0.0, _PATCH_SPREAD, (count, 1))
+    return np.clip(colour, *_PATCH_GREY)
 
 
 def _leaf_outlines(rng: np.random.Generator, radius: NDArray[np.float64]) -> list[NDArray[np.int32]]:
@@ -168,11 +181,11 @@ def _leaf_outlines(rng: np.random.Generator, radius: NDArray[np.float64]) -> lis
     """
     count = len(radius)
     polygon, ellipse, streak = range(3)
-    kind = rng.choice(3, size=count, p=(0.7, 0.2, 0.1))
-    corners = np.where(kind == polygon, rng.integers(3, 8, count), np.where(kind == ellipse, 16, 4))
-    irregular = np.where(kind == polygon, 0.35, 0.0)
-    flat = np.where(kind == streak, 0.1, rng.uniform(0.4, 1.0, count))
-    long = np.where(kind == streak, 2.5, 1.0) * radius
+    kind = rng.choice(3, size=count, p=_KINDS)
+    corners = np.where(kind == polygon, rng.integers(3, 8, count), np.where(kind == ellipse, _ELLIPSE_CORNERS, 4))
+    irregular = np.where(kind == polygon, _IRREGULAR, 0.0)
+    flat = np.where(kind == streak, _STREAK_WIDTH, rng.uniform(*_FLATNESS, count))
+    long = np.where(kind == streak, _STREAK_LENGTH, 1.0) * radius
     turn = rng.uniform(0.0, np.pi, count)
     c, s = np.cos(turn), np.sin(turn)
     axes = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1) * flat[:, None]], axis=-2)

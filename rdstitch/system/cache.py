@@ -9,7 +9,6 @@ import hashlib
 import os
 import tempfile
 import time
-from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -36,54 +35,48 @@ _READERS = ("imagecodecs", "pillow", "pillow-heif", "rawpy", "simplejpeg", "tiff
 _PACKAGES = ("numpy", "scipy", *_OPENCV, *_READERS)
 
 
-class Stored(ABC, Generic[Value]):
-    """A result that is read when it is needed."""
-
-    @property
-    @abstractmethod
-    def key(self) -> object:
-        """What stands for the result in the inputs of later ones."""
-
-    @abstractmethod
-    def load(self) -> Value:
-        """The result."""
-
-    def remove(self) -> None:
-        """Remove its file, if it has one; it can not be loaded any more then."""
-
-
 @dataclass(frozen=True)
-class InMemory(Stored[Value]):
+class InMemory(Generic[Value]):
     """A result that is not, or could not be, kept on disk."""
 
     value: Value
 
     @property
     def key(self) -> Value:
+        """What stands for the result in the inputs of later ones."""
         return self.value
 
     def load(self) -> Value:
+        """The result."""
         return self.value
+
+    def remove(self) -> None:
+        """There is no file to remove."""
 
 
 @dataclass(frozen=True)
-class OnDisk(Stored[Value]):
-    """An entry of a cache."""
+class OnDisk(Generic[Value]):
+    """An entry of a cache; its result is read when it is needed."""
 
     file: Path
     folder: TemporaryFolder | None = field(default=None, compare=False, repr=False)  # what must not be removed before
+
+    @property
+    def key(self) -> str:
+        """What stands for the result in the inputs of later ones."""
+        return _entry_name(self.file)
 
     def load(self) -> Value:
         """The result; those used recently are still in memory."""
         return cast(Value, _recent.recall(self.file))
 
-    @property
-    def key(self) -> str:
-        return _entry_name(self.file)
-
     def remove(self) -> None:
+        """Remove its file; it can not be loaded any more then."""
         with suppress(OSError):
             self.file.unlink()
+
+
+Stored = InMemory[Value] | OnDisk[Value]
 
 
 @dataclass(frozen=True)
@@ -128,7 +121,7 @@ class Cache:
         return self.recall_many(stage, [inputs], lambda _: [compute()])[0]
 
     def stored(self, stage: str, inputs: tuple[Any, ...], compute: Callable[[], Value]) -> Stored[Value]:
-        """As :meth:`recall`, but the result stays on disk until it is loaded."""
+        """Give what a stage gives for its inputs, which stays on disk until it is loaded; see :meth:`recall`."""
         if self.folder is None:
             return InMemory(compute())
         file = self._file(stage, inputs)
@@ -140,7 +133,7 @@ class Cache:
     def recall_many(
         self, stage: str, inputs: Sequence[tuple[Any, ...]], compute: Callable[[list[int]], list[Value]]
     ) -> list[Value]:
-        """As :meth:`recall`, of several; ``compute`` is called with the places of the inputs without a result."""
+        """Give what a stage gives for several inputs; ``compute`` gets the places of those without a result."""
         if self.folder is None:
             return compute(list(range(len(inputs))))
         files = [self._file(stage, of_one) for of_one in inputs]

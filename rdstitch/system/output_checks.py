@@ -133,7 +133,7 @@ def holds_only_tiles(folder: Path) -> bool:
 
 @contextmanager
 def naming(name: Path) -> Iterator[None]:
-    """A failure of the file system is one of writing this output."""
+    """Turn failures of the file system into those of writing this output."""
     try:
         yield
     except OSError as error:

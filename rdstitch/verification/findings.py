@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from enum import Enum, auto
+from enum import Enum
 from string import Formatter
 from typing import NamedTuple
 
@@ -23,9 +23,9 @@ class Scope(Enum):
 class Misfit(Enum):
     """Why matches agree with each other only."""
 
-    FEW_FEATURES = auto()
-    FEW_MATCHES = auto()
-    OTHER_MOTION = auto()
+    FEW_FEATURES = ""  # of some images, which the sentence names
+    FEW_MATCHES = "too few to place it: little overlap, or none?"
+    OTHER_MOTION = "they fit each other: does it show another surface, or come from another camera or zoom?"
 
 
 class Images(tuple[int, ...]):
@@ -180,15 +180,10 @@ def _in_words(value: Value, finding: Finding, given: Registration) -> object:
 
 
 def _misfit_in_words(misfit: Misfit, finding: Finding, given: Registration) -> str:
-    remedy = " stitch them on their own" if finding.kind is Kind.PAIR_MISFITS else ""
-    match misfit:
-        case Misfit.FEW_FEATURES:
-            few = ((given.sources[k].name, few_features(given.keypoints, k)) for k in finding.images)
-            return ", ".join(f"{name} has {why}" for name, why in few if why)
-        case Misfit.FEW_MATCHES:
-            return f"too few to place it: little overlap, or none?{remedy}"
-        case Misfit.OTHER_MOTION:
-            return f"they fit each other: does it show another surface, or come from another camera or zoom?{remedy}"
+    if misfit is Misfit.FEW_FEATURES:
+        few = ((given.sources[k].name, few_features(given.keypoints, k)) for k in finding.images)
+        return ", ".join(f"{name} has {why}" for name, why in few if why)
+    return str(misfit.value) + " stitch them on their own" * (finding.kind is Kind.PAIR_MISFITS)
 
 
 def _names(given: Registration, images: Iterable[int]) -> list[str]:

@@ -17,7 +17,7 @@ class Limit:
 
 
 class Limits:
-    """Of matches, pixels, patterns, second motions, layouts and inputs; fractions of what their names say."""
+    """Limits on matches, pixels, patterns, second motions, layouts and inputs; fractions of what their names say."""
 
     # Matches.
     min_pair_inlier_fraction = Limit(0.5, "fraction", "by definition: less is another motion than that of the whole")

@@ -77,13 +77,13 @@ class ComparedImages:
         self._read = read
 
     def placed(self, k: int, camera: Camera, homography: FloatArray) -> ComparedImage:
-        """One of them, where a homography puts it with a camera of any size."""
+        """An image where a homography puts it, with a camera of any size."""
         with self._locks[k]:
             image = self._read(k)
         return replace(image, camera=camera.resized(image.camera.image_size), homography=homography)
 
     def aligned(self, alignment: Alignment, images: Iterable[int]) -> dict[int, ComparedImage]:
-        """Some of them, where an alignment puts them."""
+        """Some images where an alignment puts them."""
         chosen = sorted(set(images))
         with ThreadPoolExecutor(self.threads) as pool:
             every = pool.map(lambda k: self.placed(k, alignment.cameras[k], alignment.homographies[k]), chosen)

@@ -73,7 +73,7 @@ class ComparedImage:
     def of(
         cls, image: DecodedImage, camera: Camera, homography: FloatArray, stretch: tuple[float, float] | None = None
     ) -> Self:
-        """An image with its camera and its place, made small; ``stretch`` are the grey levels of black and white."""
+        """Make an image with its camera and its place small; ``stretch`` are the grey levels of black and white."""
         grey = _reduced_grey(image, stretch)
         grey[_plain_frame(grey)] = np.nan
         return cls(grey, camera.resized((grey.shape[1], grey.shape[0])), homography)
@@ -112,7 +112,7 @@ def _reduced_grey(image: DecodedImage, stretch: tuple[float, float] | None) -> G
 
 
 def _plain_frame(grey: Grey) -> NDArray[np.bool_]:
-    """Where rows and columns from the border on show nothing: frames of two images coincide wherever these lie."""
+    """Mark rows and columns from the border on that show nothing: frames of two images coincide wherever these lie."""
     frame = np.zeros_like(grey, dtype=np.bool_)
     for image, masked in ((grey, frame), (grey.T, frame.T)):
         inside = ~masked.all(axis=0)

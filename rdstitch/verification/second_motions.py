@@ -1,4 +1,4 @@
-"""Of two motions in the same images, which is that of the plane?
+"""Which of two motions in the same images is that of the plane?
 
 A vehicle ahead, or a part of the robot, has matches that agree with each other, and may have more of them than the
 plane. What contradicts a motion says which is which: something that hardly moves is put over nearly all of the next

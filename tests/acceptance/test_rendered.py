@@ -12,12 +12,12 @@ from examples.judging.trajectories import compare_trajectories
 from examples.worlds.floor_drives import DISTORTION, PATHS, floor_drive, read_path, true_path
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import read_image
-from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, pair_poses, sequence_over
+from rdstitch.synthetic import Photometry, RenderedSequence, grid_poses, ground, pair_poses, sequence_over
 from tests.cli.running import FAST, finished, start
 from tests.sampled import sampled
 
 
-def _shown(sequence: Sequence, output: Path, model: str) -> PlaneComparison:
+def _shown(sequence: RenderedSequence, output: Path, model: str) -> PlaneComparison:
     """The written image against what the images could see of the true plane, up to one transform."""
     found = read_image(output)
     shown = np.dstack([found.pixels, found.alpha])
@@ -77,7 +77,7 @@ SETS = {
 }
 
 
-def _sequence(view: View, seed: int) -> Sequence:
+def _sequence(view: View, seed: int) -> RenderedSequence:
     lens = Camera(view.size, view.distortion, focal=view.focal)
     tilt = np.radians(view.tilt[0]), np.radians(view.tilt[1])
     poses = grid_poses(lens, *view.grid, overlap=0.4, yaw=np.radians(view.yaw), tilt=tilt, seed=seed)

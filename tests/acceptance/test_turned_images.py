@@ -15,7 +15,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import turned, turning_matrix
 from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.io.read import read_image
-from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
+from rdstitch.synthetic import Photometry, RenderedSequence, grid_poses, ground, sequence_over
 from tests.sampled import sampled
 
 LENS = Camera((480, 360), -0.25, center=(244.5, 175.5), focal=400.0)
@@ -24,7 +24,7 @@ MIRROR = 2
 
 
 @pytest.fixture(scope="module")
-def sequence() -> Sequence:
+def sequence() -> RenderedSequence:
     poses = grid_poses(LENS, 4, 2, overlap=0.5, tilt=(0.05, -0.03), yaw=0.2, seed=4)
     return sequence_over(partial(ground, seed=4), LENS, poses, photometry=Photometry(noise=0.005), seed=4)
 
@@ -33,7 +33,7 @@ def is_mirrored(orientation: int) -> bool:
     return bool(np.linalg.det(turning_matrix(orientation)) < 0.0)
 
 
-def written(sequence: Sequence, orientations: tuple[int, ...], folder: Path) -> list[Path]:
+def written(sequence: RenderedSequence, orientations: tuple[int, ...], folder: Path) -> list[Path]:
     """Images as a camera stores them whose lens bends the stored frame."""
     folder.mkdir()
     files = []
@@ -54,7 +54,9 @@ def in_upright(points: FloatArray, orientation: int) -> FloatArray:
     return plain.turned(orientation).denormalize(stored @ turning_matrix(orientation).T)
 
 
-def errors_of(sequence: Sequence, orientations: tuple[int, ...], result: rdstitch.StitchResult) -> list[AlignmentError]:
+def errors_of(
+    sequence: RenderedSequence, orientations: tuple[int, ...], result: rdstitch.StitchResult
+) -> list[AlignmentError]:
     """Of the images that are not mirrored, and of those that are."""
     alignment = result.registration.alignment
     assert alignment.used.all()
@@ -72,7 +74,9 @@ def errors_of(sequence: Sequence, orientations: tuple[int, ...], result: rdstitc
 
 
 @pytest.mark.parametrize("orientations", [MIRRORED, pytest.param(PROPER, marks=pytest.mark.slow)])
-def test_a_mosaic_finds_the_stored_lens(sequence: Sequence, orientations: tuple[int, ...], tmp_path: Path) -> None:
+def test_a_mosaic_finds_the_stored_lens(
+    sequence: RenderedSequence, orientations: tuple[int, ...], tmp_path: Path
+) -> None:
     files = written(sequence, orientations, tmp_path / "frames")
     options = rdstitch.StitchOptions(save_camera=tmp_path / "camera.json")
     result = rdstitch.mosaic(files, tmp_path / "out.png", options)
@@ -86,7 +90,7 @@ def test_a_mosaic_finds_the_stored_lens(sequence: Sequence, orientations: tuple[
 
 @pytest.mark.parametrize("orientations", [ALL, pytest.param(PROPER, marks=pytest.mark.slow)])
 def test_a_camera_file_is_of_the_stored_frame(
-    sequence: Sequence, orientations: tuple[int, ...], tmp_path: Path
+    sequence: RenderedSequence, orientations: tuple[int, ...], tmp_path: Path
 ) -> None:
     files = written(sequence, orientations, tmp_path / "frames")
     LENS.save(tmp_path / "camera.json")
@@ -97,7 +101,7 @@ def test_a_camera_file_is_of_the_stored_frame(
         assert error.max < 0.3
 
 
-def test_undistortion_turns_the_lens(sequence: Sequence, tmp_path: Path) -> None:
+def test_undistortion_turns_the_lens(sequence: RenderedSequence, tmp_path: Path) -> None:
     files = written(sequence, ALL, tmp_path / "frames")
     stored = [np.asarray(Image.open(file)) for file in files]
     expected = rdstitch.undistort(stored, camera=LENS, channel_order="rgb")
@@ -108,7 +112,9 @@ def test_undistortion_turns_the_lens(sequence: Sequence, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("orientation", sampled([6, 3, 8]))
-def test_a_mosaic_stands_as_its_reference_image_does(sequence: Sequence, orientation: int, tmp_path: Path) -> None:
+def test_a_mosaic_stands_as_its_reference_image_does(
+    sequence: RenderedSequence, orientation: int, tmp_path: Path
+) -> None:
     orientations = (1, 1, 1, orientation)
     files = written(sequence, orientations, tmp_path / "frames")
     result = rdstitch.mosaic(files, options=rdstitch.StitchOptions(reference="3.png", dry_run=True))

@@ -5,18 +5,18 @@ from pathlib import Path
 import pytest
 from rdstitch_cli.main import run
 
-from rdstitch.synthetic import Sequence
+from rdstitch.synthetic import RenderedSequence
 from tests.cli.running import CACHED, Outcome, Run, check_sidecar, copied, flight
 
 
 @pytest.fixture(scope="session")
-def sequence() -> Sequence:
+def sequence() -> RenderedSequence:
     """The truth about ``frames``."""
     return flight(3, 3)
 
 
 @pytest.fixture(scope="session")
-def frames(sequence: Sequence, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def frames(sequence: RenderedSequence, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Three images of 400 x 300 px that overlap in a chain; never written to."""
     return sequence.write(tmp_path_factory.mktemp("frames"))
 

@@ -24,7 +24,7 @@ from rdstitch.geometry.camera_record import CameraRecord
 from rdstitch.geometry.radial_homography import project
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.sidecar.read import json_schema
-from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
+from rdstitch.synthetic import Photometry, RenderedSequence, grid_poses, ground, sequence_over
 from rdstitch.system.records import convert
 
 
@@ -91,7 +91,9 @@ Run = Callable[..., Outcome]
 """The fixture ``rdstitch``."""
 
 
-def flight(seed: int, columns: int, rows: int = 1, distortion: float = DISTORTION, overlap: float = 0.5) -> Sequence:
+def flight(
+    seed: int, columns: int, rows: int = 1, distortion: float = DISTORTION, overlap: float = 0.5
+) -> RenderedSequence:
     lens = Camera((400, 300), distortion=distortion, focal=380.0)
     poses = grid_poses(lens, columns, rows, overlap=overlap, yaw=0.1, shift=0.05, tilt=(0.05, -0.03), seed=seed)
     return sequence_over(partial(ground, seed=seed), lens, poses, photometry=Photometry(noise=0.01), seed=seed)

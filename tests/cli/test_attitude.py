@@ -11,7 +11,7 @@ from examples.worlds.drone_xmp import euler_angles, xmp_of
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.geometry.planar_motion import turned_tilt
-from rdstitch.synthetic import Photometry, Sequence, grid_poses, ground, sequence_over
+from rdstitch.synthetic import Photometry, RenderedSequence, grid_poses, ground, sequence_over
 from tests.cli.running import CACHED, Run
 from tests.sampled import sampled
 
@@ -19,7 +19,7 @@ LENS = Camera((400, 300), -0.2, focal=380.0)
 
 
 @pytest.fixture(scope="module")
-def windy() -> Sequence:
+def windy() -> RenderedSequence:
     """A drone that tilts by another few degrees for each of six images."""
     poses = grid_poses(LENS, 3, 2, overlap=0.5, yaw=0.1, seed=4).shaken(seed=5, tilt=np.radians(4.0))
     return sequence_over(
@@ -27,7 +27,7 @@ def windy() -> Sequence:
     )
 
 
-def _table(sequence: Sequence, paths: list[Path], error: float) -> str:
+def _table(sequence: RenderedSequence, paths: list[Path], error: float) -> str:
     tilt = np.degrees(sequence.poses.tilt[: len(paths)]) + np.random.default_rng(1).normal(
         scale=error, size=(len(paths), 2)
     )
@@ -35,7 +35,7 @@ def _table(sequence: Sequence, paths: list[Path], error: float) -> str:
     return "\n".join(["name,psi,theta,altitude", *rows])
 
 
-def _with_xmp(sequence: Sequence, folder: Path, source: str) -> list[Path]:
+def _with_xmp(sequence: RenderedSequence, folder: Path, source: str) -> list[Path]:
     """The images as JPEG files that tell the true attitudes in one maker's words."""
     paths = []
     for index in range(len(sequence)):
@@ -52,7 +52,7 @@ UPRIGHT, TURNED = (1, 1, 1, 1, 1, 1), (1, 6, 3, 8, 6, 1)  # by EXIF
     ("error", "std", "orientations"), sampled([(0.3, np.radians(0.3), UPRIGHT), (0.0, 0.0, TURNED)])
 )
 def test_measured_tilts_are_used_as_those_of_the_camera_whatever_exif_turns(
-    windy: Sequence, tmp_path: Path, error: float, std: float, orientations: tuple[int, ...]
+    windy: RenderedSequence, tmp_path: Path, error: float, std: float, orientations: tuple[int, ...]
 ) -> None:
     paths = windy.write(tmp_path)
     (tmp_path / "imu.csv").write_text(_table(windy, paths, error))
@@ -77,7 +77,7 @@ def test_measured_tilts_are_used_as_those_of_the_camera_whatever_exif_turns(
 
 
 @pytest.mark.parametrize(("source", "std"), sampled([("dji-gimbal", 0.0), ("pix4d-camera", np.radians(1.0))]))
-def test_drones_write_tilts_into_their_images(windy: Sequence, tmp_path: Path, source: str, std: float) -> None:
+def test_drones_write_tilts_into_their_images(windy: RenderedSequence, tmp_path: Path, source: str, std: float) -> None:
     paths = _with_xmp(windy, tmp_path, source)
     options = rdstitch.StitchOptions(attitude="xmp", attitude_std=std, focal=LENS.focal, workers=1)
     _, registration = rdstitch.trajectory(paths, options=options)
@@ -87,7 +87,9 @@ def test_drones_write_tilts_into_their_images(windy: Sequence, tmp_path: Path, s
     assert np.degrees(np.abs(alignment.poses.tilt - windy.poses.tilt)).max() < (0.01 if std == 0.0 else 1.0)
 
 
-def test_images_without_attitude_are_named(rdstitch: Run, windy: Sequence, frames: list[Path], tmp_path: Path) -> None:
+def test_images_without_attitude_are_named(
+    rdstitch: Run, windy: RenderedSequence, frames: list[Path], tmp_path: Path
+) -> None:
     paths = _with_xmp(windy, tmp_path, "parrot-camera")[:2]
     arguments = ("calibrate", "--attitude", "xmp", "-o", tmp_path / "camera.json", *CACHED)
     rdstitch(*arguments, *paths)
@@ -108,7 +110,7 @@ def test_cameras_that_look_at_the_horizon_are_refused(rdstitch: Run, frames: lis
     assert "86 degrees away from straight down" in done.line
 
 
-def test_pairs_get_one_tilt_an_image(windy: Sequence, tmp_path: Path) -> None:
+def test_pairs_get_one_tilt_an_image(windy: RenderedSequence, tmp_path: Path) -> None:
     paths = windy.write(tmp_path)[:2]
     (tmp_path / "imu.csv").write_text(_table(windy, paths, 0.0))
     options = rdstitch.StitchOptions(

@@ -21,14 +21,16 @@ from rdstitch.pipeline import accept, blocks
 from rdstitch.pipeline.recipes import stitch_images
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
-from rdstitch.synthetic import Sequence
+from rdstitch.synthetic import RenderedSequence
 from rdstitch.verification.findings import Kind
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, flight, sidecar_of, start, transfers
 from tests.registrations import finding
 from tests.sampled import sampled
 
 
-def test_a_folder_becomes_one_image(rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path) -> None:
+def test_a_folder_becomes_one_image(
+    rdstitch: Run, frames: list[Path], sequence: RenderedSequence, tmp_path: Path
+) -> None:
     done = rdstitch("mosaic", frames[0].parent, "-o", tmp_path / "mosaic.tif", *CACHED, err="")
     assert abs(float(done.out) - DISTORTION) < 0.01
     record = sidecar_of(tmp_path / "mosaic.tif")

@@ -10,11 +10,13 @@ import pytest
 from examples.judging import alignment_error, compare_with_plane
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import read_image
-from rdstitch.synthetic import Sequence
+from rdstitch.synthetic import RenderedSequence
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, sidecar_of, transfers
 
 
-def test_writes_image_sidecar_and_camera(rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path) -> None:
+def test_writes_image_sidecar_and_camera(
+    rdstitch: Run, frames: list[Path], sequence: RenderedSequence, tmp_path: Path
+) -> None:
     output, camera = tmp_path / "pano.png", tmp_path / "camera.json"
     done = rdstitch("pano", *frames, "-o", output, "--save-camera", camera, *CACHED, err="")
     assert done.out == f"{float(done.out):.6f}\n"

@@ -22,7 +22,7 @@ from rdstitch.camera_files.lens_models import RATIONAL, nearest_model
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.rosbag import camera_in_bag
 from rdstitch.io import read_image
-from rdstitch.synthetic import Photometry, Sequence, ground, sequence_over
+from rdstitch.synthetic import Photometry, RenderedSequence, ground, sequence_over
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, rows_of, start
 from tests.videos import write_video
 
@@ -253,7 +253,7 @@ def test_python_gets_labels_and_a_camera_file_too(frames: list[Path], tmp_path: 
     assert np.isnan(path.timestamp).all()
 
 
-def test_csv_holds_the_path(rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path) -> None:
+def test_csv_holds_the_path(rdstitch: Run, frames: list[Path], sequence: RenderedSequence, tmp_path: Path) -> None:
     known = ("--focal", str(sequence.lens.focal), "--plot", tmp_path / "path.svg")
     done = rdstitch("trajectory", frames[0].parent, "-o", tmp_path / "path.csv", *known, *CACHED, err="")
     assert abs(float(done.out) - DISTORTION) < 0.01

@@ -10,11 +10,13 @@ from rdstitch import undistort
 from rdstitch.errors import LimitError
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import read_image, read_metadata
-from rdstitch.synthetic import Sequence
+from rdstitch.synthetic import RenderedSequence
 from tests.cli.running import DISTORTION, FAST, Run
 
 
-def test_pixels_are_where_the_model_says(rdstitch: Run, frames: list[Path], sequence: Sequence, tmp_path: Path) -> None:
+def test_pixels_are_where_the_model_says(
+    rdstitch: Run, frames: list[Path], sequence: RenderedSequence, tmp_path: Path
+) -> None:
     rdstitch("undistort", *frames, "--lambda", str(DISTORTION), "-o", tmp_path / "new" / "folder", out="", err="")
     written = sorted((tmp_path / "new" / "folder").iterdir())
     assert [path.name for path in written] == [path.name for path in frames]

@@ -16,7 +16,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.synthetic import ImageTexture, Photometry, Sequence, ground, sequence_over
+from rdstitch.synthetic import ImageTexture, Photometry, RenderedSequence, ground, sequence_over
 from rdstitch.synthetic.poses import Poses
 from rdstitch.synthetic.textures import Texture
 from tests.cli.running import CACHED, Run, sidecar_of
@@ -38,19 +38,19 @@ def _lined(size: tuple[int, int]) -> Texture:
     return ImageTexture(plane)
 
 
-def _taken(plane: Any, folder: Path) -> tuple[Sequence, list[Path]]:
+def _taken(plane: Any, folder: Path) -> tuple[RenderedSequence, list[Path]]:
     poses = Poses.of([(0.0, 0.0), (110.0, 0.0), (220.0, 0.0)], 420.0, ROLL, TILT)
     sequence = sequence_over(plane, LENS, poses, photometry=Photometry(noise=0.005), seed=2)
     return sequence, sequence.write(folder)
 
 
 @pytest.fixture(scope="module")
-def facade(tmp_path_factory: pytest.TempPathFactory) -> tuple[Sequence, list[Path]]:
+def facade(tmp_path_factory: pytest.TempPathFactory) -> tuple[RenderedSequence, list[Path]]:
     return _taken(_lined, tmp_path_factory.mktemp("facade"))
 
 
 @pytest.fixture(scope="module")
-def registered(facade: tuple[Sequence, list[Path]], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def registered(facade: tuple[RenderedSequence, list[Path]], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The sidecar of its panorama, with nothing turned."""
     from rdstitch_cli.main import run
 
@@ -59,7 +59,7 @@ def registered(facade: tuple[Sequence, list[Path]], tmp_path_factory: pytest.Tem
     return Path(f"{output}.json")
 
 
-def _placed(sidecar: Path, sequence: Sequence) -> tuple[float, float, float]:
+def _placed(sidecar: Path, sequence: RenderedSequence) -> tuple[float, float, float]:
     """Of texels in the output: angle of verticals, degrees; aspect ratio over the true one; error, pixels, in shape."""
     record = json.loads(sidecar.read_text("utf-8"))
     pixels = np.stack(np.meshgrid(np.linspace(60, 340, 8), np.linspace(50, 250, 6)), axis=-1).reshape(-1, 2)
@@ -74,27 +74,27 @@ def _placed(sidecar: Path, sequence: Sequence) -> tuple[float, float, float]:
     return float(angle), float(np.hypot(ax, ay) / np.hypot(bx, by)), error
 
 
-def _check_upright(output: Path, sequence: Sequence, of_aspect: float = 0.01) -> None:
+def _check_upright(output: Path, sequence: RenderedSequence, of_aspect: float = 0.01) -> None:
     angle, aspect, error = _placed(Path(f"{output}.json"), sequence)
     assert angle < 0.2
     assert aspect == pytest.approx(1.0, abs=of_aspect)
     assert error < 1.0 or of_aspect > 0.01
 
 
-def _corners(sequence: Sequence) -> str:
+def _corners(sequence: RenderedSequence) -> str:
     middle = sequence.to_plane(0, [(199.5, 149.5)])[0]
     corners = sequence.to_image(0, middle + np.array([(-120, -80), (120, -80), (120, 80), (-120, 80)]))
     return ",".join(f"{value:.1f}" for value in corners.ravel())
 
 
-def _lines(sequence: Sequence) -> str:
+def _lines(sequence: RenderedSequence) -> str:
     values = np.array(_corners(sequence).split(",")).reshape(4, 2)
     return ";".join(",".join([*values[a], *values[b]]) for a, b in ((0, 1), (3, 2), (0, 3), (1, 2)))
 
 
 @pytest.mark.parametrize("way", ["auto", "lines", "rectangle"])
 def test_a_facade_becomes_upright(
-    way: str, facade: tuple[Sequence, list[Path]], registered: Path, rdstitch: Run, tmp_path: Path
+    way: str, facade: tuple[RenderedSequence, list[Path]], registered: Path, rdstitch: Run, tmp_path: Path
 ) -> None:
     sequence, paths = facade
     assert _placed(registered, sequence)[0] > 4.0
@@ -114,7 +114,7 @@ def test_a_facade_becomes_upright(
 
 
 def test_the_output_is_cropped_to_the_rectangle(
-    facade: tuple[Sequence, list[Path]], registered: Path, rdstitch: Run, tmp_path: Path
+    facade: tuple[RenderedSequence, list[Path]], registered: Path, rdstitch: Run, tmp_path: Path
 ) -> None:
     sequence, paths = facade
     how = ("--images", paths[0].parent, "-o", tmp_path / "up.png", "--rectangle", _corners(sequence))
@@ -128,7 +128,9 @@ def test_the_output_is_cropped_to_the_rectangle(
     np.testing.assert_allclose(to_plane(lens, np.array(image["to_output"]), corners), ends, atol=1.0)
 
 
-def test_a_mosaic_becomes_upright_at_once(facade: tuple[Sequence, list[Path]], rdstitch: Run, tmp_path: Path) -> None:
+def test_a_mosaic_becomes_upright_at_once(
+    facade: tuple[RenderedSequence, list[Path]], rdstitch: Run, tmp_path: Path
+) -> None:
     output = tmp_path / "up.png"
     rdstitch("mosaic", *facade[1], "-o", output, *KNOWN, "--straighten", "auto", *CACHED)
     _check_upright(output, facade[0])
@@ -145,7 +147,9 @@ def test_where_nothing_is_straight_nothing_is_turned(rdstitch: Run, tmp_path: Pa
     assert plain.read_bytes() == output.read_bytes()
 
 
-def test_the_rectangle_tells_a_focal_length(facade: tuple[Sequence, list[Path]], rdstitch: Run, tmp_path: Path) -> None:
+def test_the_rectangle_tells_a_focal_length(
+    facade: tuple[RenderedSequence, list[Path]], rdstitch: Run, tmp_path: Path
+) -> None:
     sequence, paths = facade
     output = tmp_path / "up.png"
     how = ("--lambda", "-0.1", "--reference", paths[0].name, "--model", "homography")
@@ -154,7 +158,7 @@ def test_the_rectangle_tells_a_focal_length(facade: tuple[Sequence, list[Path]],
     _check_upright(output, sequence, 0.03)
 
 
-def test_gravity_makes_a_wall_level(facade: tuple[Sequence, list[Path]], rdstitch: Run, tmp_path: Path) -> None:
+def test_gravity_makes_a_wall_level(facade: tuple[RenderedSequence, list[Path]], rdstitch: Run, tmp_path: Path) -> None:
     """By the attitude in XMP roll and pitch go; a wall that is seen obliquely stays so."""
     sequence, paths = facade
     c, s = np.cos(ROLL), np.sin(ROLL)
@@ -175,7 +179,7 @@ def test_gravity_makes_a_wall_level(facade: tuple[Sequence, list[Path]], rdstitc
 
 
 def test_without_gravity_what_is_vertical_in_most_images_is_level(
-    facade: tuple[Sequence, list[Path]], registered: Path, rdstitch: Run, tmp_path: Path
+    facade: tuple[RenderedSequence, list[Path]], registered: Path, rdstitch: Run, tmp_path: Path
 ) -> None:
     """The output is turned about its axis alone, until the images stand as upright as they can."""
     output = tmp_path / "up.png"
@@ -199,7 +203,7 @@ def test_places_need_an_image_that_they_are_in() -> None:
 
 @pytest.mark.parametrize("corners", ["0,0,9,0,9,9", "a,b", "10,10,10,200,300,200,300,10", "9,9,300,9,20,20,9,200"])
 def test_corners_that_are_none_are_refused(
-    corners: str, facade: tuple[Sequence, list[Path]], registered: Path, rdstitch: Run, tmp_path: Path
+    corners: str, facade: tuple[RenderedSequence, list[Path]], registered: Path, rdstitch: Run, tmp_path: Path
 ) -> None:
     how = ("--images", facade[1][0].parent, "-o", tmp_path / "x.png", "--rectangle", corners)
     rdstitch("apply", registered, *how, status=2, told="rectangle")

@@ -17,8 +17,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.features import FeatureOptions, detect, match
 from rdstitch.geometry.camera import Camera
 from rdstitch.io.read import read_image
-from rdstitch.synthetic import Photometry, ground, pair_poses, sequence_over
-from rdstitch.synthetic import Sequence as RenderedSequence
+from rdstitch.synthetic import Photometry, RenderedSequence, ground, pair_poses, sequence_over
 
 _SUFFIXES = (".ppm", ".png", ".jpg")
 _WARP = 0.25  # of the sides, by which corners of made scenes are moved

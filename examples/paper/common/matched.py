@@ -1,6 +1,6 @@
 """Matched pairs of images, rendered with known truth and real, that several figures use."""
 
-from collections.abc import Sequence as Many
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.features import FeatureOptions, detect, match
 from rdstitch.geometry.camera import Camera
 from rdstitch.io.read import read_image
-from rdstitch.synthetic import Photometry, Sequence, ground, pair_poses, sequence_over
+from rdstitch.synthetic import Photometry, RenderedSequence, ground, pair_poses, sequence_over
 from rdstitch.synthetic.lenses import Lens
 
 Tilt = tuple[float, float]
@@ -40,14 +40,16 @@ def rendered_pair(
     direction: float = 0.6,
     scale: float = 1.0,
     tilt: Tilt = (0.0, 0.0),
-) -> Sequence:
+) -> RenderedSequence:
     """Two images of a floor; noise and vignetting as of a small camera."""
     poses = pair_poses(lens, overlap, yaw=yaw, direction=direction, scale=scale, tilt=tilt)
     photometry = Photometry(gain=np.array([1.0, 0.85]), vignetting=0.2, blur=0.5, noise=0.01)
     return sequence_over(lambda size: ground(size, seed), lens, poses, photometry=photometry, seed=seed)
 
 
-def match_rendered(sequence: Sequence, name: str, *, ratio: float | None = None, features: int = 2000) -> MatchedPair:
+def match_rendered(
+    sequence: RenderedSequence, name: str, *, ratio: float | None = None, features: int = 2000
+) -> MatchedPair:
     """Matches of the first two images of a sequence, whose poses have one tilt."""
     options = FeatureOptions(max_features=features)
     first, second = (detect(sequence.frame(index), options) for index in (0, 1))
@@ -57,7 +59,7 @@ def match_rendered(sequence: Sequence, name: str, *, ratio: float | None = None,
     return MatchedPair(name, matches.points1, matches.points2, -matches.ratio, camera, (float(psi), float(theta)))
 
 
-def match_files(files: Many[Path], *, ratio: float | None = None, features: int = 4000) -> list[MatchedPair]:
+def match_files(files: Sequence[Path], *, ratio: float | None = None, features: int = 4000) -> list[MatchedPair]:
     """Matches of consecutive images; their focal length is guessed."""
     options = FeatureOptions(max_features=features)
     images = [read_image(file).pixels for file in files]

@@ -1,6 +1,6 @@
 """Sequences through rdstitch's own recipes, and how far the result is from the truth."""
 
-from collections.abc import Sequence as Many
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,10 +12,10 @@ from rdstitch.io.read import read_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import calibrate, mosaic
 from rdstitch.results.registration import Registration
-from rdstitch.synthetic import Sequence
+from rdstitch.synthetic import RenderedSequence
 
 
-def stitch_files(files: Many[Path], options: StitchOptions) -> tuple[Registration, Pixels]:
+def stitch_files(files: Sequence[Path], options: StitchOptions) -> tuple[Registration, Pixels]:
     """The registration and the mosaic of some images."""
     with TemporaryDirectory(prefix="rdstitch-paper-") as folder:
         output = Path(folder) / "mosaic.png"
@@ -23,13 +23,13 @@ def stitch_files(files: Many[Path], options: StitchOptions) -> tuple[Registratio
         return result.registration, np.asarray(read_image(output).pixels)
 
 
-def stitch_rendered(sequence: Sequence, options: StitchOptions) -> tuple[Registration, Pixels]:
+def stitch_rendered(sequence: RenderedSequence, options: StitchOptions) -> tuple[Registration, Pixels]:
     """The same of a rendered sequence."""
     with TemporaryDirectory(prefix="rdstitch-paper-") as folder:
         return stitch_files(sequence.write(folder), options)
 
 
-def register_files(files: Many[Path], options: StitchOptions) -> Registration | str:
+def register_files(files: Sequence[Path], options: StitchOptions) -> Registration | str:
     """The registration alone; the reason where there is none."""
     try:
         return calibrate(files, options)

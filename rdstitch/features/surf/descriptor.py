@@ -16,7 +16,8 @@ from rdstitch.features.surf.patches import Grey, apply_kernels, integer_kernels,
 from rdstitch.features.surf.refinement import refine
 
 _THRESHOLD = 100.0  # determinant of the Hessian from which on a blob counts, grey levels²
-_OCTAVES, _LAYERS = 4, 3  # of scale, and scales per octave
+_OCTAVES = 4  # of scale
+_LAYERS = 3  # scales per octave
 _RADIUS = 6  # of the disc of gradients, units of s
 _GRADIENT_SIGMA = 1.5  # of the derivatives, units of s; about as wide as the paper's wavelets of 4s
 _GRADIENT_WEIGHT_SIGMA = 2.5  # of the gradients' weight, units of s

@@ -17,7 +17,7 @@ from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.odometry import BodyPose, read_odometry
-from rdstitch.synthetic import Sequence
+from rdstitch.synthetic import RenderedSequence
 from rdstitch.tracking import TrackingResult
 
 HEIGHT, LEVER, MOUNT = 0.42, 0.15 - 0.06j, np.exp(0.5j * np.pi)  # metres; the top of the image is ahead
@@ -137,18 +137,18 @@ def test_a_path_has_a_value_of_each_kind_a_frame() -> None:
 
 
 @pytest.fixture(scope="module")
-def drive() -> Sequence:
+def drive() -> RenderedSequence:
     return floor_drive("turn", 16, seed=3, size=(320, 240), overlap=0.6)
 
 
-def _metres(drive: Sequence) -> Trajectory:
+def _metres(drive: RenderedSequence) -> Trajectory:
     path = true_path(drive)
     turn, first = np.exp(1j * path.yaw[0]), path.position[0]
     places = turn * ((path.position - first) @ [1.0, 1.0j]) * HEIGHT / path.height[0]
     return replace(path, position=np.stack([places.real, places.imag], axis=1), yaw=path.yaw - path.yaw[0])
 
 
-def _files(drive: Sequence, folder: Path) -> dict[str, Any]:
+def _files(drive: RenderedSequence, folder: Path) -> dict[str, Any]:
     """Odometry at twice the rate of the frames, and times of these."""
     bodies, times = _bodies(_metres(drive), 0.01), np.arange(len(drive)) * 0.1
     between = [BodyPose(*np.mean([a, b], axis=0)) for a, b in pairwise(bodies)]
@@ -162,7 +162,7 @@ def _files(drive: Sequence, folder: Path) -> dict[str, Any]:
 CAMERA = Camera((320, 240), DISTORTION, focal=256.0, focal_source="option")
 
 
-def test_offline_and_live_give_metres_and_bridge_what_shows_nothing(drive: Sequence, tmp_path: Path) -> None:
+def test_offline_and_live_give_metres_and_bridge_what_shows_nothing(drive: RenderedSequence, tmp_path: Path) -> None:
     images = list(drive.frames())
     for k in (9, 10):
         images[k] = np.full_like(images[k], 120)

@@ -102,9 +102,9 @@ def test_no_image_is_read_for_more_than_two_blocks(columns: int, rows: int, tmp_
     scene, read, blocks = render(columns, rows, size=(160, 120), scale=0.75), Counter[int](), 0
 
     def counted(index: int, placed: PlacedImage) -> PlacedImage:
-        def load() -> DecodedImage:
+        def load(reduction: int) -> DecodedImage:
             read[index] += 1
-            return placed.read()
+            return placed.read(reduction)
 
         return replace(placed, read=load)
 

@@ -1,7 +1,6 @@
 """Composites of rendered sets: exposure, seams, blending, crop, files."""
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from examples.worlds.compositing_scenes import (
     gradient,
     grey,
     inner,
+    loader,
     place_images,
     render,
     side_by_side,
@@ -269,7 +269,7 @@ def test_sixteen_bits_grey_and_mixed_sizes() -> None:
     # One image at half the resolution: the same lens, another size.
     frames[1] = cv2.resize(frames[1], (160, 120), interpolation=cv2.INTER_AREA)
     cameras = [c if k != 1 else c.resized((160, 120)) for k, c in enumerate(scene.cameras)]
-    sources = [partial(as_image, frame) for frame in frames]
+    sources = [loader(as_image(frame)) for frame in frames]
     result = compose(place_images(sources, cameras, scene.homographies), scene.canvas, CompositeOptions())
     assert result.pixels.dtype == np.uint16
     assert result.pixels.ndim == 2
@@ -300,10 +300,10 @@ def test_images_that_do_not_fit_and_wrong_options() -> None:
         with pytest.raises(ArgumentError):
             CompositeOptions(**wrong_option)
     scene = render(2, 1)
-    wrong: list[ImageLoader] = [scene.sources[0], partial(as_image, np.zeros((10, 10, 3), np.uint8))]
+    wrong: list[ImageLoader] = [scene.sources[0], loader(as_image(np.zeros((10, 10, 3), np.uint8)))]
     with pytest.raises(InputError, match="image 2"):
         compose(place_images(wrong, scene.cameras, scene.homographies), scene.canvas)
-    deep: list[ImageLoader] = [scene.sources[0], partial(as_image, np.zeros((240, 320, 3), np.uint16))]
+    deep: list[ImageLoader] = [scene.sources[0], loader(as_image(np.zeros((240, 320, 3), np.uint16)))]
     with pytest.raises(InputError, match="uint16"):
         compose(place_images(deep, scene.cameras, scene.homographies), scene.canvas)
     with pytest.raises(ArgumentError):

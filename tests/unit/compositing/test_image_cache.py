@@ -37,13 +37,13 @@ class DecodedImageCache:
         self.frames = [rng.integers(0, 256, (100, 200), dtype=np.uint8) for _ in range(4)]
         self.reads: Counter[int] = Counter()
 
-    def read(self, index: int) -> DecodedImage:
+    def read(self, index: int, reduction: int) -> DecodedImage:
         self.reads[index] += 1
-        return as_image(self.frames[index])
+        return reduced(as_image(self.frames[index]), reduction)
 
     def cache(self, limit: int, *, ahead: bool = False) -> ImageCache:
         lens = Camera((200, 100))
-        read = [lambda k=k: self.read(k) for k in range(4)]
+        read = [lambda reduction, k=k: self.read(k, reduction) for k in range(4)]
         reader = ImageReader(place_images(read, [lens] * 4, [np.eye(3)] * 4))
         assert reader.samples[0] == 1
         self.reads.clear()
@@ -76,9 +76,7 @@ def test_what_waits_on_disk_comes_back_as_it_was(kind: str) -> None:
     frames = [rng.integers(0, 200, (99, 201, 3)).astype(kind) for _ in range(3)]
     alpha = np.where(rng.random((99, 201)) < 0.1, np.uint8(0), np.uint8(255))
     images = [replace(as_image(frame), alpha=alpha) for frame in frames]
-    reader = ImageReader(
-        place_images([partial(lambda p: p, p) for p in images], [Camera((201, 99))] * 3, [np.eye(3)] * 3)
-    )
+    reader = ImageReader(place_images([partial(reduced, p) for p in images], [Camera((201, 99))] * 3, [np.eye(3)] * 3))
     cache, whole = ImageCache(reader, [1.0] * 3, 1), [prepare_image(p, 1.0) for p in images]
     for _ in range(2):
         for index in range(3):
@@ -153,10 +151,10 @@ def test_nothing_is_read_ahead_once_it_is_closed() -> None:
     cache = decoded_images.cache(limit=80_000, ahead=True)
     reading, go_on = Event(), Event()
 
-    def slow(index: int) -> DecodedImage:
+    def slow(index: int, reduction: int) -> DecodedImage:
         reading.set()
         assert go_on.wait(30)
-        return DecodedImageCache.read(decoded_images, index)
+        return DecodedImageCache.read(decoded_images, index, reduction)
 
     decoded_images.read = slow  # type: ignore[method-assign]
     cache.prefetch(range(4))
@@ -174,16 +172,15 @@ def test_the_room_for_an_image_is_known_before(shrink: float, masked: bool) -> N
     image = as_image(np.zeros((300, 400), dtype=np.uint8))
     if masked:
         image = replace(image, alpha=np.eye(300, 400, dtype=np.uint8) * 255)
-    for preview in (None, partial(reduced, image)):
-        reader = ImageReader([PlacedImage(lambda: image, Camera((400, 300)), np.eye(3), preview)])
-        assert reader.masked(0) is masked
-        assert reader.nbytes(0, shrink) >= reader.prepared(0, shrink).nbytes
+    reader = ImageReader([PlacedImage(partial(reduced, image), Camera((400, 300)), np.eye(3))])
+    assert reader.masked(0) is masked
+    assert reader.nbytes(0, shrink) >= reader.prepared(0, shrink).nbytes
 
 
 def test_a_grey_image_before_coloured_ones_gets_colours() -> None:
     grey, coloured = (as_image(np.full((3, 4, *bands), 7, dtype=np.uint8)) for bands in ((), (3,)))
     images = [
-        PlacedImage(partial(replace, image), Camera((4, 3)), np.eye(3), coloured=image is coloured)
+        PlacedImage(partial(reduced, image), Camera((4, 3)), np.eye(3), coloured=image is coloured)
         for image in (grey, coloured)
     ]
     for reader in (ImageReader(images), ImageReader(images).part([0])):
@@ -212,14 +209,11 @@ def _counted(scene: Scene, decoded: Counter[int], *, masked: bool) -> list[Place
         alpha[:20] = 0
         image = as_image(frame, alpha if masked and index % 3 else None)
 
-        def read(index: int = index, image: DecodedImage = image) -> DecodedImage:
-            decoded[index] += 1
-            return image
-
-        def preview(reduction: int, image: DecodedImage = image) -> DecodedImage:
+        def read(reduction: int, index: int = index, image: DecodedImage = image) -> DecodedImage:
+            decoded[index] += reduction == 1
             return reduced(image, reduction)
 
-        images.append(replace(placed, read=read, preview=preview))
+        images.append(replace(placed, read=read))
     return images
 
 

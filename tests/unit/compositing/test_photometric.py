@@ -1,7 +1,6 @@
 """Overlaps, the light that they tell, the seams in them, and pixels that stay with the camera."""
 
 from collections.abc import Sequence
-from functools import partial
 from itertools import combinations, product
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from examples.worlds.compositing_scenes import as_image, place_images, render, side_by_side
+from examples.worlds.compositing_scenes import as_image, loader, place_images, render, side_by_side
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import cell_least_squares, field_fit, gain_compensation, overlap_cells, plan_canvas
 from rdstitch.compositing.boxes import intersection, overlapping_pairs
@@ -23,6 +22,7 @@ from rdstitch.compositing.source_images import ImageReader, PlacedImage
 from rdstitch.compositing.static_pixels import static_pixels
 from rdstitch.compositing.survey import Survey, survey_images
 from rdstitch.compositing.warp import locate, plan_warp
+from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.conjugate_gradients import conjugate_gradients
 from rdstitch.synthetic import ground
@@ -58,7 +58,7 @@ def _row(count: int, width: int = 32) -> tuple[Survey, list[PlacedImage]]:
     step = width / 2 / lens.scale
     places = np.array([[[1, 0, k * step], [0, 1, 0], [0, 0, 1]] for k in range(count)], dtype=np.float64)
     cameras = [lens] * count
-    images = place_images([partial(as_image, frame) for frame in frames], cameras, places)
+    images = place_images([loader(as_image(frame)) for frame in frames], cameras, places)
     return survey_images(ImageReader(images), images, plan_canvas(cameras, places)), images
 
 
@@ -173,11 +173,16 @@ def test_most_of_a_scene_may_be_black(black: float) -> None:
     ground[: round(48 * black)] = 0
     frames = [ground[:, :64].astype(np.uint8), (1.5 * ground[:, 32:]).astype(np.uint8)]
     places = np.array([[[1, 0, x / lens.scale], [0, 1, 0], [0, 0, 1]] for x in (0.0, 32.0)])
-    images = place_images([partial(as_image, frame) for frame in frames], [lens] * 2, places)
+    images = place_images([loader(as_image(frame)) for frame in frames], [lens] * 2, places)
     survey = survey_images(ImageReader(images), images, plan_canvas([lens] * 2, places))
     gains = np.exp(estimate_exposure(survey, images, "gain").log_gain)
     np.testing.assert_allclose(gains[1] / gains[0], 1.5, rtol=0.03)
     assert 0.75 < gains[0].mean() < 0.95
+
+
+def test_an_exposure_that_is_not_finite_is_refused() -> None:
+    with pytest.raises(ArgumentError, match="not finite"):
+        Exposure(0.0, np.full((1, 3), np.nan))
 
 
 def test_an_image_without_overlap_has_the_gain_that_its_camera_wrote_down() -> None:

@@ -1,12 +1,11 @@
 """Projections, the part of the ground that is near enough, and views that are turned upright."""
 
 import math
-from functools import partial
 
 import numpy as np
 import pytest
 
-from examples.worlds.compositing_scenes import as_image, gradient, grey, place_images
+from examples.worlds.compositing_scenes import as_image, gradient, grey, loader, place_images
 from examples.worlds.turns import TurningSequence, camera_rotations, turning_sequence
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import ProjectionName
@@ -44,7 +43,7 @@ def _composed(
 ) -> Composite:
     frames = sequence.frames()
     return compose(
-        place_images([partial(as_image, frame) for frame in frames], [LENS] * len(frames), directions), canvas, options
+        place_images([loader(as_image(frame)) for frame in frames], [LENS] * len(frames), directions), canvas, options
     )
 
 

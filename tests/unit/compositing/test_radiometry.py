@@ -15,11 +15,7 @@ from rdstitch.compositing.source_images import PlacedImage
 from rdstitch.geometry.camera import Camera
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.radiometric_tags import Radiometry, read_radiometry
-from rdstitch.io.read import DecodedImage
-
-
-def _given(image: DecodedImage) -> DecodedImage:
-    return image
+from rdstitch.io.read import DecodedImage, reduced
 
 
 def _field(times: tuple[float, ...], index: float = 2.0) -> tuple[list[PlacedImage], np.ndarray]:
@@ -31,7 +27,7 @@ def _field(times: tuple[float, ...], index: float = 2.0) -> tuple[list[PlacedIma
         samples = np.rint(scene[:, 100 * k : 100 * k + 200] * time / 0.01).astype(np.uint16)
         part = DecodedImage(samples, None, Metadata((200, 120)))
         shift = np.array([[camera.scale, 0.0, 100.0 * k], [0.0, camera.scale, 0.0], [0.0, 0.0, 1.0]])
-        images.append(PlacedImage(partial(_given, part), camera, shift, exposure=time, radiometry=Radiometry()))
+        images.append(PlacedImage(partial(reduced, part), camera, shift, exposure=time, radiometry=Radiometry()))
     return images, scene
 
 
@@ -59,10 +55,10 @@ def test_light_that_changes_and_a_black_level_leave_an_index_as_it_is() -> None:
     for index in (1.0, 2.0):  # bands whose ratio is 2 everywhere
         images, scene = _field(tuple(np.multiply(light, times)), index)
         for k, image in enumerate(images):
-            decoded = image.read()
+            decoded = image.read(1)
             dark = replace(decoded, pixels=decoded.pixels + np.uint16(4800))
             told = Radiometry(4800 / 65535, light[k] * 0.7, "HorizontalIrradiance")
-            images[k] = replace(image, read=partial(_given, dark), exposure=times[k], radiometry=told)
+            images[k] = replace(image, read=partial(reduced, dark), exposure=times[k], radiometry=told)
         canvas = plan_canvas([image.camera for image in images], [image.homography for image in images])
         result = compose(images, canvas, options)
         assert "irradiance by XMP (HorizontalIrradiance)" in result.messages[0].text

@@ -48,7 +48,7 @@ def test_seams_of_images_that_fit_hold_whatever_their_brightness(gain: float) ->
     quality = _quality(gain * _shifted(0, 0) + 10.0)
     assert len(quality.places) > 25
     assert not quality.broken.any()
-    assert not quality.seen
+    assert not quality.broken_at_reference_size
 
 
 @pytest.mark.parametrize("label_size", [1.0, 2.0, 2.5])
@@ -59,7 +59,7 @@ def test_content_that_is_shifted_at_a_seam_is_a_break_with_its_place_and_size(la
     np.testing.assert_allclose(longest.position, (800.0, 600.0), atol=100.0)
     assert 4.0 * 70.0 < longest.length < 4.0 * 130.0
     assert longest.size == pytest.approx(4.0 * np.hypot(3, 8), abs=4.0)
-    assert quality.seen
+    assert quality.broken_at_reference_size
     assert not quality.broken[np.abs(quality.places[:, 1] - 600.0) > 4.0 * 70.0].any()
 
 
@@ -76,7 +76,7 @@ def test_an_object_that_is_cut_in_half_is_a_break() -> None:
     first, second = scene.copy(), scene.copy()
     second[100:200, 150:250] = np.where(np.indices((100, 100)).sum(axis=0) % 40 < 20, np.float32(40), np.float32(220))
     quality = measure_seams([_tile(image, (0, 0, *SIZE)) for image in (first, second)], LABELS, 1.0, 1.0)
-    assert quality.seen
+    assert quality.broken_at_reference_size
     assert all(90.0 < y < 210.0 for _, y in quality.places[quality.broken])
 
 
@@ -92,7 +92,7 @@ def test_what_is_left_of_a_crop_is_counted_from_its_corner() -> None:
 def test_nothing_is_said_of_images_without_texture_or_without_neighbours() -> None:
     flat: Float32Array = np.zeros((SIZE[1], SIZE[0]), dtype=np.float32)
     assert not len(measure_seams([_tile(flat, (0, 0, *SIZE))] * 2, LABELS, 1.0, 1.0).places)
-    assert not measure_seams([_tile(flat, (0, 0, *SIZE)), None], LABELS, 1.0, 1.0).seen
+    assert not measure_seams([_tile(flat, (0, 0, *SIZE)), None], LABELS, 1.0, 1.0).broken_at_reference_size
 
 
 def test_how_alike_overlaps_look_what_that_fills_and_the_pair_that_does_so_the_least() -> None:
@@ -118,7 +118,7 @@ def test_images_that_are_put_anywhere_are_alike_by_chance(right: int, down: int,
         _tile(pixels, (0, 0, *SIZE)) for pixels in (_shifted(0, 0, scene=SCENE), _shifted(right, down, scene=SCENE))
     ]
     quality = SeamQuality(alike=likeness(tiles, np.array([[1, 0]])).alike)
-    assert (quality.by_chance, quality.contradicted) == (by_chance, by_chance)
+    assert (quality.no_better_than_chance, quality.mostly_unlike) == (by_chance, by_chance)
 
 
 def test_grass_in_the_wind_is_no_break() -> None:
@@ -150,14 +150,14 @@ def test_twigs_and_pebbles_that_do_not_fit_are_no_break(moved: bool) -> None:
     tiles = [_tile(image[: SIZE[1], : SIZE[0]], (0, 0, *SIZE)) for image in (first, second)]
     quality = measure_seams(tiles, LABELS, 1.0, 1.0)
     assert len(quality.places) > 25
-    assert not quality.fit  # it speaks against a layout all the same
-    assert not quality.seen
+    assert not quality.seams_fit  # it speaks against a layout all the same
+    assert not quality.broken_at_reference_size
 
 
 def test_a_small_output_hides_what_a_large_one_shows() -> None:
     breaks = (SeamBreak((0, 1), (0.0, 0.0), 64.0, 4.0),)
     shown = SeamQuality(np.zeros((20, 2)), broken=np.arange(20) < 8, breaks=breaks, spacing=8.0)
     tenth = replace(shown, breaks=(SeamBreak((0, 1), (0.0, 0.0), 6.4, 0.4),), spacing=0.8)
-    assert shown.visible
-    assert tenth.seen
-    assert not tenth.visible
+    assert shown.broken_in_output
+    assert tenth.broken_at_reference_size
+    assert not tenth.broken_in_output

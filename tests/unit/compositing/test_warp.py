@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from examples.worlds.compositing_scenes import as_image, grey, inner, place_images, render
+from examples.worlds.compositing_scenes import as_image, grey, inner, loader, place_images, render
 from rdstitch.compositing import Composite, CompositeOptions, compose, plan_canvas
 from rdstitch.compositing.warp import locate, plan_warp
 from rdstitch.geometry.camera import Camera
@@ -20,7 +20,7 @@ def _alone(
     """One image in its own frame."""
     lens = Camera((frame.shape[1], frame.shape[0]), distortion=distortion)
     planned = plan_canvas([lens], np.eye(3)[None], **canvas)  # type: ignore[arg-type]
-    return compose(place_images([lambda: as_image(frame, alpha)], [lens], np.eye(3)[None]), planned, PLAIN)
+    return compose(place_images([loader(as_image(frame, alpha))], [lens], np.eye(3)[None]), planned, PLAIN)
 
 
 def test_identity_gives_the_image_back_and_a_quarter_turn_the_image_turned() -> None:
@@ -72,7 +72,7 @@ def test_coverage_ends_half_a_pixel_outside() -> None:
         matrix[0, 2] = shift / lens.scale
         canvas = type(base)((60, 40), base.matrix, (base.footprints[0] + (shift, 0.0),))
         result = compose(
-            place_images([lambda: as_image(np.full((40, 50), 9, np.uint8))], [lens], matrix[None]), canvas, PLAIN
+            place_images([loader(as_image(np.full((40, 50), 9, np.uint8)))], [lens], matrix[None]), canvas, PLAIN
         )
         covered = np.flatnonzero(result.alpha[20])
         assert (covered[0], covered[-1]) == (first, first + 49)

@@ -16,6 +16,7 @@ from PIL import Image, PngImagePlugin
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
 from rdstitch.io import Metadata, read_image, read_metadata
+from rdstitch.io.attitude import CONVENTIONS
 from rdstitch.io.lens_correction import corrected
 from rdstitch.io.read import DecodedImage
 
@@ -179,7 +180,7 @@ class TestMetadata:
         assert metadata.gps.altitude == -12.5
         assert metadata.gps.std == pytest.approx((0.05 / 2**0.5, 0.06))
         assert (metadata.attitude.yaw, metadata.attitude.pitch, metadata.attitude.roll) == (31.5, -89.9, 0.25)
-        assert metadata.attitude.source == "dji-gimbal"
+        assert metadata.attitude.convention == CONVENTIONS["dji-gimbal"]
         assert (metadata.make, metadata.model) == ("Maker", "Model")
 
     def test_a_hemisphere_that_is_not_told_is_not_guessed(self, tmp_path: Path) -> None:
@@ -194,7 +195,7 @@ class TestMetadata:
         (path,) = (p for p in shared_data("textures_cc0").iterdir() if p.suffix == ".JPG")
         metadata = read_metadata(path)
         assert metadata.focal_px == pytest.approx(3641.79, abs=0.01)
-        assert metadata.attitude.source == "pix4d-camera"
+        assert metadata.attitude.convention == CONVENTIONS["pix4d-camera"]
         assert metadata.serial == "PI040378AA6C000032"
         assert metadata.gps.latitude == pytest.approx(41.429198, abs=1e-6)
 

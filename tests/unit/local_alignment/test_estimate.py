@@ -27,7 +27,7 @@ from rdstitch.matching.two_view import PairRegistration
 from rdstitch.pipeline.lay_out import align_registration_locally
 from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 from rdstitch.robust.per_image_distortion import _coherence
-from rdstitch.synthetic import RELIEFS, Sequence, blank, grid_poses, sequence_over
+from rdstitch.synthetic import RELIEFS, RenderedSequence, blank, grid_poses, sequence_over
 from tests.registrations import registration
 
 SIZE = (640, 480)
@@ -95,13 +95,13 @@ CAMERAS = [LENS] * 6
 @lru_cache
 def scene(
     kind: str | None, height: float = 0.05, seed: int = 1, overlap: float = 0.5, tilt: tuple[float, float] = (0.0, 0.0)
-) -> Sequence:
+) -> RenderedSequence:
     poses = grid_poses(LENS, 3, 2, overlap=overlap, yaw=0.1, shift=0.05, tilt=tilt, seed=seed)
     relief = None if kind is None else lambda size: RELIEFS[kind](size, seed, height=height * 520.0)
     return sequence_over(lambda size: blank(size), LENS, poses, relief=relief)
 
 
-def homographies(sequence: Sequence, level: float | None = None) -> FloatArray:
+def homographies(sequence: RenderedSequence, level: float | None = None) -> FloatArray:
     """Of the images to the plane at a level, texels, or at the mean height of the ground."""
     poses, relief = sequence.poses, sequence.relief
     if level is None:
@@ -114,13 +114,15 @@ def homographies(sequence: Sequence, level: float | None = None) -> FloatArray:
     return np.stack([lowered[k] @ np.linalg.inv(sequence.from_plane(k)) @ scale for k in range(len(poses))])
 
 
-def centers(sequence: Sequence) -> FloatArray:
+def centers(sequence: RenderedSequence) -> FloatArray:
     """Where the cameras are above the plane at the mean height of the ground, texels."""
     level = 0.0 if sequence.relief is None else float(sequence.relief.height.mean())
     return np.column_stack([sequence.poses.position, sequence.poses.height - level])
 
 
-def matches(sequence: Sequence, noise: float = 0.2, wrong: float = 0.0, count: int = 400) -> list[PutativeMatches]:
+def matches(
+    sequence: RenderedSequence, noise: float = 0.2, wrong: float = 0.0, count: int = 400
+) -> list[PutativeMatches]:
     """Matches of all pairs that overlap, with noise and a share of wrong ones among them."""
     rng = np.random.default_rng(3)
     found = []
@@ -138,12 +140,14 @@ def matches(sequence: Sequence, noise: float = 0.2, wrong: float = 0.0, count: i
     return found
 
 
-def off_and_on(sequence: Sequence, matrices: FloatArray, local: LocalAlignment) -> tuple[FloatArray, FloatArray]:
+def off_and_on(
+    sequence: RenderedSequence, matrices: FloatArray, local: LocalAlignment
+) -> tuple[FloatArray, FloatArray]:
     """How far images are apart without and with local alignment."""
     return displacements(sequence, matrices, replace(local, fields=())), displacements(sequence, matrices, local)
 
 
-def displacements(sequence: Sequence, matrices: FloatArray, local: LocalAlignment) -> FloatArray:
+def displacements(sequence: RenderedSequence, matrices: FloatArray, local: LocalAlignment) -> FloatArray:
     """How far two images are apart on the ground, texels, where both show the same place of the output."""
     rng = np.random.default_rng(4)
     found = []
@@ -253,7 +257,7 @@ def test_on_a_plane_nothing_is_moved(noise: float) -> None:
     assert local.before is None  # what neighbours have nothing of in common needs no fit
 
 
-def tracked(sequence: Sequence, noise: float, seed: int, warp: float) -> list[PutativeMatches]:
+def tracked(sequence: RenderedSequence, noise: float, seed: int, warp: float) -> list[PutativeMatches]:
     """Matches of 101 points of the ground, each with one keypoint in every view, that smooth waves displace."""
     rng = np.random.default_rng(seed)
     ground = sequence.to_ground(len(sequence) // 2, rng.uniform((0, 0), (639, 479), (101, 2)))

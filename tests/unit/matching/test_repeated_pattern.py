@@ -25,7 +25,7 @@ from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.static_background import has_static_background, is_static_pair, moving_features, show_motion
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.robust import EstimationOptions
-from rdstitch.synthetic import ImageTexture, Photometry, Sequence, grid_poses, ground, sequence_over
+from rdstitch.synthetic import ImageTexture, Photometry, RenderedSequence, grid_poses, ground, sequence_over
 
 CAMERA = Camera((640, 480), -0.2)
 POINTS = np.random.default_rng(0).uniform((5.0, 5.0), (634.0, 474.0), (300, 2))
@@ -187,7 +187,7 @@ def test_a_place_is_static_in_images_of_the_same_size_only() -> None:
     assert [len(left) for left in moving_features(FeatureStore.of(features), pairs, THRESHOLD)] == [0, 0, 0, 40, 40]
 
 
-def test_pairs_of_a_board_are_matched_where_others_are(board: Sequence) -> None:
+def test_pairs_of_a_board_are_matched_where_others_are(board: RenderedSequence) -> None:
     said, tasks = list[str](), list[object]()
 
     class Counting(ThreadPoolExecutor):
@@ -213,7 +213,7 @@ _OPTIONS = FeatureOptions(max_features=800)
 
 
 @pytest.fixture(scope="module")
-def board() -> Sequence:
+def board() -> RenderedSequence:
     """Images of a chessboard with some dirt on it, from above and aslant."""
     squares = np.kron(np.indices((20, 44)).sum(axis=0) % 2, np.ones((_SIDE, _SIDE)))
     rng = np.random.default_rng(0)
@@ -223,17 +223,17 @@ def board() -> Sequence:
     return sequence_over(ImageTexture(pixels), _LENS, poses)
 
 
-def _features(sequence: Sequence, index: int) -> Features:
+def _features(sequence: RenderedSequence, index: int) -> Features:
     return detect(sequence.frame(index), _OPTIONS)
 
 
-def test_boards_repeat_themselves_and_ground_does_not(board: Sequence) -> None:
+def test_boards_repeat_themselves_and_ground_does_not(board: RenderedSequence) -> None:
     plain = sequence_over(partial(ground, seed=3), _LENS, board.poses)
     assert repetition(_features(board, 0)) > 2 * _MIN_REPETITION
     assert repetition(_features(plain, 0)) < _MIN_REPETITION / 2
 
 
-def test_matches_are_right_or_off_by_whole_squares(board: Sequence) -> None:
+def test_matches_are_right_or_off_by_whole_squares(board: RenderedSequence) -> None:
     first, second = _features(board, 0), _features(board, 1)
     found = match_pattern(first, second)
     assert len(found) > 100
@@ -245,13 +245,13 @@ def test_matches_are_right_or_off_by_whole_squares(board: Sequence) -> None:
     assert len(np.unique(found.indices[:, 0])) == len(np.unique(found.indices[:, 1])) == len(found)
 
 
-def test_other_ground_has_no_such_matches(board: Sequence) -> None:
+def test_other_ground_has_no_such_matches(board: RenderedSequence) -> None:
     plain = sequence_over(partial(ground, seed=3), _LENS, board.poses)
     assert len(match_pattern(_features(board, 0), _features(plain, 0))) < 30
     assert len(match_pattern(detect(board.frame(0), FeatureOptions("orb")), _features(board, 1))) == 0
 
 
-def test_matching_many_keypoints_takes_memory_for_some_of_them_at_a_time(board: Sequence) -> None:
+def test_matching_many_keypoints_takes_memory_for_some_of_them_at_a_time(board: RenderedSequence) -> None:
     few = _features(board, 0)
     many = few.take(np.resize(np.arange(len(few)), 3000))
     tracemalloc.start()
@@ -262,7 +262,7 @@ def test_matching_many_keypoints_takes_memory_for_some_of_them_at_a_time(board: 
 
 
 @pytest.mark.slow
-def test_calibrate_matches_boards_so_and_mosaics_do_not(board: Sequence) -> None:
+def test_calibrate_matches_boards_so_and_mosaics_do_not(board: RenderedSequence) -> None:
     """A mosaic could be off by whole squares."""
     stages: dict[bool, set[str]] = {True: set(), False: set()}
     for lens_only, found in stages.items():

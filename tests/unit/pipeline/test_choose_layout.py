@@ -95,7 +95,7 @@ def test_where_heights_of_the_ground_explain_parallax_no_other_model_is_tried(by
 def test_what_a_homography_stretches_is_laid_out_as_a_turn(shared_data: Callable[[str], Path]) -> None:
     result = mosaic([shared_data("cases/picture_smear_school")])
     assert result.registration.alignment.model == "rotation"
-    assert not result.seams.seen
+    assert not result.seams.broken_at_reference_size
     assert result.registration.alignment.used.all()
 
 

@@ -28,14 +28,14 @@ from rdstitch.features.prepared_image import View, prepare
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
 from rdstitch.robust import EstimationOptions
-from rdstitch.synthetic import Sequence, ground, sequence_over
+from rdstitch.synthetic import RenderedSequence, ground, sequence_over
 from rdstitch.tracking import FrameTracker
 
 HEIGHT = 0.8
 
 
 @pytest.fixture(scope="module")
-def drive() -> Sequence:
+def drive() -> RenderedSequence:
     return floor_drive("turn", 12, seed=3, size=(320, 240), overlap=0.6)
 
 
@@ -43,7 +43,7 @@ def _tracker() -> rdstitch.Tracker:
     return rdstitch.Tracker(rdstitch.StitchOptions(distortion=DISTORTION, focal=256.0), rdstitch.FollowedPoses(HEIGHT))
 
 
-def test_metric_poses_near_the_truth_and_reasons_for_the_first_frames(drive: Sequence) -> None:
+def test_metric_poses_near_the_truth_and_reasons_for_the_first_frames(drive: RenderedSequence) -> None:
     tracker = _tracker()
     poses: dict[int, rdstitch.Pose] = {}
     for number, frame in enumerate(drive.frames()):
@@ -97,7 +97,7 @@ def _all_poses(tracker: rdstitch.Tracker, images: Iterable[NDArray[np.uint8]]) -
     return poses
 
 
-def _errors(poses: dict[int, rdstitch.Pose], drive: Sequence) -> FloatArray:
+def _errors(poses: dict[int, rdstitch.Pose], drive: RenderedSequence) -> FloatArray:
     """How far (N, 2) positions are from the truth, metres, in the axes of the first image."""
     truth = true_path(drive)
     turn = np.exp(1j * truth.yaw[0])
@@ -106,7 +106,9 @@ def _errors(poses: dict[int, rdstitch.Pose], drive: Sequence) -> FloatArray:
     return np.stack([errors.real, errors.imag], axis=1)
 
 
-def test_with_lens_and_tilt_the_second_frame_has_a_pose_and_errors_are_as_large_as_they_say(drive: Sequence) -> None:
+def test_with_lens_and_tilt_the_second_frame_has_a_pose_and_errors_are_as_large_as_they_say(
+    drive: RenderedSequence,
+) -> None:
     tracker = rdstitch.Tracker(rdstitch.StitchOptions(camera=CAMERA, tilt=TILT), rdstitch.FollowedPoses(HEIGHT))
     first = tracker.add(drive.frame(0))
     assert (bool(first), first.reason) == (False, "first frame")
@@ -133,7 +135,7 @@ def test_with_lens_and_tilt_the_second_frame_has_a_pose_and_errors_are_as_large_
         assert np.trace(pose.covariance[:2, :2]) > (0.99 * pose.length_std * math.hypot(x, y)) ** 2
 
 
-def test_what_stays_in_the_image_is_no_floor(drive: Sequence) -> None:
+def test_what_stays_in_the_image_is_no_floor(drive: RenderedSequence) -> None:
     part = np.kron(np.random.default_rng(1).integers(0, 255, (6, 32, 3)), np.ones((10, 10, 1))).astype(np.uint8)
     tracker = rdstitch.Tracker(rdstitch.StitchOptions(camera=CAMERA), rdstitch.FollowedPoses(HEIGHT))
     poses = _all_poses(tracker, (np.concatenate([image[:180], part]) for image in drive.frames()))
@@ -212,13 +214,13 @@ def test_a_focal_length_that_the_images_contradict_is_replaced_and_lengths_are_a
     assert last[-1].length_std < 0.02
 
 
-def test_a_short_drive_without_a_camera_has_all_its_poses_at_the_end(drive: Sequence) -> None:
+def test_a_short_drive_without_a_camera_has_all_its_poses_at_the_end(drive: RenderedSequence) -> None:
     poses = _rows(rdstitch.Tracker(rdstitch.StitchOptions()), drive.frames()[:4])
     assert len(poses) == 4
     assert all(poses)
 
 
-def test_after_a_jump_it_finds_its_place_in_the_map(drive: Sequence) -> None:
+def test_after_a_jump_it_finds_its_place_in_the_map(drive: RenderedSequence) -> None:
     tracker = rdstitch.Tracker(rdstitch.StitchOptions(camera=CAMERA, tilt=TILT), rdstitch.FollowedPoses(HEIGHT))
     images = drive.frames()
     poses = _all_poses(tracker, [*images, np.full_like(images[0], 120), images[1], images[2]])
@@ -232,7 +234,7 @@ def test_after_a_jump_it_finds_its_place_in_the_map(drive: Sequence) -> None:
 # LimitError where its worker was killed, RuntimeError of a singular matrix.
 @pytest.mark.parametrize("error", [ImpossibleCameraError, LimitError, RuntimeError])
 def test_an_alignment_that_fails_is_survived(
-    error: type[Exception], drive: Sequence, monkeypatch: pytest.MonkeyPatch
+    error: type[Exception], drive: RenderedSequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(*_: object) -> None:
         raise error("what went wrong")

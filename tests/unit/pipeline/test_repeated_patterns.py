@@ -19,14 +19,14 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.io import write_image
 from rdstitch.pipeline import register as stages
 from rdstitch.pipeline import repeated_patterns
-from rdstitch.synthetic import ImageTexture, Photometry, Sequence, grid_poses, ground, repeated, sequence_over
+from rdstitch.synthetic import ImageTexture, Photometry, RenderedSequence, grid_poses, ground, repeated, sequence_over
 from rdstitch.verification.unique_places import UniqueShift
 
 _LENS = Camera((400, 300), distortion=-0.25, focal=380.0)
 _OPTIONS = rdstitch.StitchOptions(workers=1, features=FeatureOptions(max_features=800))
 
 
-def _board() -> Sequence:
+def _board() -> RenderedSequence:
     pixels = np.kron(np.indices((20, 44)).sum(axis=0) % 2, np.ones((40, 40)))
     poses = grid_poses(_LENS, 4, 1, overlap=0.6, yaw=0.2, shift=0.05, seed=3).shaken(seed=4, tilt=0.12)
     return sequence_over(ImageTexture((60 + 130 * pixels).astype(np.uint8)), _LENS, poses)
@@ -65,7 +65,7 @@ LENS = Camera((320, 240), distortion=-0.15, focal=350.0)
 OPTIONS = rdstitch.StitchOptions(workers=1, features=rdstitch.FeatureOptions(max_features=500))
 
 
-def _stained_tiles() -> Sequence:
+def _stained_tiles() -> RenderedSequence:
     poses = grid_poses(LENS, 2, 1, overlap=0.5, yaw=0.1, tilt=(0.03, -0.05), seed=3)
     taken = sequence_over(
         partial(repeated, seed=3, period=60), LENS, poses, photometry=Photometry(noise=0.01), seed=3, margin=60
@@ -75,7 +75,7 @@ def _stained_tiles() -> Sequence:
     rng = np.random.default_rng(8)
     for x, y in zip(rng.integers(8, width - 8, 15), rng.integers(8, height - 8, 15), strict=True):
         pixels[y - 4 : y + 5, x - 4 : x + 5] = rng.choice([0.02, 0.9])
-    return Sequence(ImageTexture(pixels), taken.lens, taken.poses, taken.photometry, seed=3)
+    return RenderedSequence(ImageTexture(pixels), taken.lens, taken.poses, taken.photometry, seed=3)
 
 
 def test_stained_tiles_are_stitched_where_the_stains_agree() -> None:

@@ -20,12 +20,12 @@ from rdstitch.synthetic import (
     Photometry,
     Poses,
     Relief,
-    Sequence,
+    RenderedSequence,
     blank,
+    bumps,
     fit_to_plane,
     grid_poses,
     ground,
-    hills,
     pair_poses,
     sequence_over,
 )
@@ -66,9 +66,9 @@ def test_a_blob_is_seen_where_projection_puts_it(lens: Lens, texels_per_pixel: f
     poses, size = fit_to_plane(lens, Poses.of([(0.0, 0.0)], texels_per_pixel * lens.focal, 0.4, (0.06, -0.05)))
     wanted = np.stack(np.meshgrid(np.linspace(25, 295, 7), np.linspace(25, 215, 5)), axis=-1).reshape(-1, 2)
     wanted += np.random.default_rng(1).uniform(-0.5, 0.5, wanted.shape)
-    sequence = Sequence(ImageTexture(np.zeros((1, 1), np.float32)), lens, poses)
+    sequence = RenderedSequence(ImageTexture(np.zeros((1, 1), np.float32)), lens, poses)
     places = sequence.to_plane(0, wanted)
-    sequence = Sequence(blobs(size, places, 2.0 * texels_per_pixel), lens, poses, Photometry(bits=16))
+    sequence = RenderedSequence(blobs(size, places, 2.0 * texels_per_pixel), lens, poses, Photometry(bits=16))
     image = sequence.frame(0).astype(np.float64)
     found = np.array([centroid(image, place) for place in wanted])
     # A round blob on the plane is seen by a lens that bends it: its centroid is off by up to 0.03 px at the corners.
@@ -114,7 +114,7 @@ def test_a_raised_box_is_seen_in_parallax() -> None:
     x, y = int(place[0]), int(place[1])
     relief = np.zeros((height, width), np.float32)
     relief[y - 20 : y + 21, x - 20 : x + 21] = 26.0
-    sequence = Sequence(blobs((width, height), place[None], 2.0), lens, poses, relief=Relief(relief))
+    sequence = RenderedSequence(blobs((width, height), place[None], 2.0), lens, poses, relief=Relief(relief))
     expected = sequence.to_image(0, poses.position[0] + (place - poses.position[0]) * 260.0 / (260.0 - 26.0))
     found = centroid(sequence.frame(0).astype(np.float64), expected)
     np.testing.assert_allclose(found, expected, atol=0.05)
@@ -232,7 +232,7 @@ def test_layers_of_endless_ground_do_not_nearly_coincide_elsewhere() -> None:
 DOWNWARDS = Camera((320, 240), -0.2, focal=260.0)
 
 
-def over(kind: str, height: float, seed: int = 1) -> Sequence:
+def over(kind: str, height: float, seed: int = 1) -> RenderedSequence:
     poses = pair_poses(DOWNWARDS, 0.5)
     return sequence_over(
         lambda size: ground(size, 1, 1),
@@ -275,7 +275,7 @@ def test_a_wall_hides_what_is_behind_it_from_one_side_only() -> None:
     behind = np.array([[310.0, 200.0]])
     lens = Camera((640, 480), 0.0, focal=400.0)
     poses = Poses.of([(200.0, 200.0), (400.0, 200.0)], 400.0)
-    sequence = Sequence(blank((600, 400)), lens, poses, relief=Relief(heights))
+    sequence = RenderedSequence(blank((600, 400)), lens, poses, relief=Relief(heights))
     from_left, from_right = (sequence.to_ground(k, sequence.to_image(k, behind)) for k in (0, 1))
     assert 280.0 <= from_left[0, 0] <= 300.0
     np.testing.assert_allclose(from_right, behind, atol=1e-6)
@@ -293,6 +293,6 @@ def test_points_of_the_ground_are_seen_where_rays_meet_them(kind: str) -> None:
 
 
 def test_ground_as_high_as_the_camera_is_refused() -> None:
-    relief = hills((100, 100), 1, height=50.0)
+    relief = bumps((100, 100), 1, height=50.0)
     with pytest.raises(ArgumentError, match="the camera only 40"):
         relief.seen_from(np.array([50.0, 50.0]), 40.0, np.zeros((3, 2)))

@@ -25,7 +25,7 @@ from rdstitch.inputs.delays import DELAYS
 from rdstitch.inputs.keyframes import fitted_affine
 from rdstitch.inputs.odometry import BodyPose
 from rdstitch.robust import EstimationOptions
-from rdstitch.synthetic import Sequence, blank, sequence_over
+from rdstitch.synthetic import RenderedSequence, blank, sequence_over
 from rdstitch.tracking import (
     FrameTracker,
     Placement,
@@ -47,7 +47,7 @@ DISTORTION = -0.25
 MASK = np.arange(240)[:, None].repeat(320, axis=1) < 190
 
 
-def _drive(count: int, overlap: float = 0.7, path: str = "turn") -> Sequence:
+def _drive(count: int, overlap: float = 0.7, path: str = "turn") -> RenderedSequence:
     lens = Camera(SIZE, DISTORTION, focal=256.0)
     return sequence_over(blank, lens, drive_poses(lens, path, count, overlap=overlap, tilt=(0.05, -0.03)))
 
@@ -55,7 +55,7 @@ def _drive(count: int, overlap: float = 0.7, path: str = "turn") -> Sequence:
 MADE_UP: dict[PreparedImage, Features] = {}
 
 
-def _frames(sequence: Sequence, world: int = 0) -> list[PreparedImage]:
+def _frames(sequence: RenderedSequence, world: int = 0) -> list[PreparedImage]:
     """Frames without corners, and in MADE_UP their features: points of the plane that are off by 0.2 pixels."""
     rng = np.random.default_rng(world)
     width, height = sequence.texture.size
@@ -94,18 +94,18 @@ def _path(results: list[TrackingResult]) -> Trajectory:
 
 
 @pytest.fixture(scope="module")
-def drive() -> Sequence:
+def drive() -> RenderedSequence:
     return _drive(40)
 
 
 @pytest.fixture(scope="module")
-def tracked(drive: Sequence) -> list[TrackingResult]:
+def tracked(drive: RenderedSequence) -> list[TrackingResult]:
     """What becomes of its frames where nothing is known."""
     tracker = _tracker()
     return [result for frame in _frames(drive) for result in tracker.add(frame, Camera(SIZE))]
 
 
-def _check(results: list[TrackingResult], sequence: Sequence) -> None:
+def _check(results: list[TrackingResult], sequence: RenderedSequence) -> None:
     """Near the truth; every frame but those before the first alignment has a place when it comes."""
     error = compare_trajectories(_path(results), true_path(sequence))
     assert error.drift < 0.004
@@ -113,12 +113,12 @@ def _check(results: list[TrackingResult], sequence: Sequence) -> None:
     assert all(result.placement is not None for result in results if result.number >= 12)
 
 
-def test_the_path_and_lambda_come_near_thetrue_path(tracked: list[TrackingResult], drive: Sequence) -> None:
+def test_the_path_and_lambda_come_near_thetrue_path(tracked: list[TrackingResult], drive: RenderedSequence) -> None:
     _check(tracked, drive)
     assert abs(tracked[-1].distortion - DISTORTION) < 0.003
 
 
-def test_a_frame_whose_place_is_not_finite_is_told_so(drive: Sequence) -> None:
+def test_a_frame_whose_place_is_not_finite_is_told_so(drive: RenderedSequence) -> None:
     known = EstimationOptions(distortion=DISTORTION), AlignmentOptions(tilt=(0.0, 0.0), lens_known=True)
     tracker = FrameTracker(*known, MADE_UP.__getitem__, partial(match, ratio=0.8), ThreadPoolExecutor(1))
     camera = Camera(SIZE, DISTORTION, focal=256.0, focal_source="option")
@@ -127,7 +127,7 @@ def test_a_frame_whose_place_is_not_finite_is_told_so(drive: Sequence) -> None:
     assert (last.pose, last.reason) == (None, "its place is not finite")
 
 
-def test_a_lambda_that_is_given_is_kept(drive: Sequence) -> None:
+def test_a_lambda_that_is_given_is_kept(drive: RenderedSequence) -> None:
     tracker = _tracker(DISTORTION)
     results = [result for frame in _frames(drive)[:14] for result in tracker.add(frame, Camera(SIZE))]
     _check(results, drive)
@@ -223,14 +223,16 @@ def test_frames_without_features_are_none_to_wait_for() -> None:
 
 
 @pytest.fixture(scope="module")
-def video() -> tuple[Sequence, list[NDArray[np.uint8]]]:
+def video() -> tuple[RenderedSequence, list[NDArray[np.uint8]]]:
     """Frames of a floor that follow one another closely."""
     drive = floor_drive("turn", 60, seed=4, size=SIZE, overlap=0.95)
     return drive, [drive.frame(index) for index in range(len(drive))]
 
 
 @pytest.mark.parametrize("body", [False, True])
-def test_between_keyframes_corners_are_followed(video: tuple[Sequence, list[NDArray[np.uint8]]], body: bool) -> None:
+def test_between_keyframes_corners_are_followed(
+    video: tuple[RenderedSequence, list[NDArray[np.uint8]]], body: bool
+) -> None:
     drive, images = video
     if body:  # of the robot, which stays where it is in the image and has corners of its own
         part = np.kron(np.random.default_rng(1).integers(0, 255, (5, 32, 3)), np.ones((10, 10, 1))).astype(np.uint8)
@@ -255,7 +257,7 @@ def test_between_keyframes_corners_are_followed(video: tuple[Sequence, list[NDAr
 
 
 def test_a_frame_that_corners_place_is_not_lost_where_they_make_no_link(
-    video: tuple[Sequence, list[NDArray[np.uint8]]], monkeypatch: pytest.MonkeyPatch
+    video: tuple[RenderedSequence, list[NDArray[np.uint8]]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tracker = _tracker(DISTORTION, lambda image: detect(image.grey, FeatureOptions(max_features=600)))
     for image in video[1][:30]:
@@ -270,7 +272,7 @@ def test_a_frame_that_corners_place_is_not_lost_where_they_make_no_link(
 
 
 def test_where_no_homography_fits_frames_are_lost_and_keyframes_stay(
-    drive: Sequence, monkeypatch: pytest.MonkeyPatch
+    drive: RenderedSequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tracker, images = _tracker(), _frames(drive)
     for image in images[:12]:
@@ -295,7 +297,7 @@ def test_where_no_homography_fits_frames_are_lost_and_keyframes_stay(
         np.testing.assert_allclose([p.x for p in poses], [scale * p.x for p in before], rtol=1e-9)
 
 
-def test_a_cut_is_no_motion(video: tuple[Sequence, list[NDArray[np.uint8]]]) -> None:
+def test_a_cut_is_no_motion(video: tuple[RenderedSequence, list[NDArray[np.uint8]]]) -> None:
     _, images = video
     flow, first = CornerFlow(), prepare(View(images[0]), None)
     flow.begin(first, corners_of(first))
@@ -475,7 +477,7 @@ def test_grey_and_deep_frames_are_painted_in_eight_bits(dtype: str, full: float)
     assert preview.pixels[preview.pixels.any(axis=2)].min() == 255
 
 
-def test_corners_are_matched_exactly_near_their_places(video: tuple[Sequence, list[NDArray[np.uint8]]]) -> None:
+def test_corners_are_matched_exactly_near_their_places(video: tuple[RenderedSequence, list[NDArray[np.uint8]]]) -> None:
     drive, images = video
     other, frame = (prepare(View(images[number]), None) for number in (2, 6))
     corners = corners_of(frame)
