@@ -26,6 +26,8 @@ def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:
         read_grid(options.like)
     wanted = {"gsd": options.gsd, "crs": options.epsg, "like": options.like, "extent": options.extent}
     for name, value in wanted.items():
+        if value is not None and options.georeference == "off" and name != "crs":  # that is of positions too
+            raise ArgumentError(f"{name} needs a georeferenced output, but georeference is off; leave one of them out")
         if value is not None and not has_place(sources):
             raise ArgumentError(
                 f"{name} needs GPS positions of {MIN_POSITIONS} images, in EXIF or a file, or ground control points; "
@@ -84,7 +86,7 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
     if place is None:
         for name in ("gsd", "like", "extent"):
             if getattr(options, name) is not None:
-                raise ArgumentError(f"{name} needs a georeferenced output: {reason}; leave it out")
+                raise ArgumentError(f"{name} needs a georeferenced output: {reason or 'that is off'}; leave it out")
         return canvas, None, reason
     if placed.grid is not None:
         return canvas, placed.grid.place, reason

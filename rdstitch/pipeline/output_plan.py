@@ -96,13 +96,14 @@ class OutputPlan:
 
     def check_places(self, sources: Sequence[Source]) -> None:
         """The same of files that place images on the Earth, once it is known whether there will be any."""
-        if has_place(sources):
+        run = self.run
+        if run.options.composite.georeference != "off" and has_place(sources):
             files = [file for image in self.images for file in world_file_paths(image)]
-            check_outputs(files, self.run.outputs.overwrite)
-        elif self.run.beside.has_poses_on_map:
+            check_outputs(files, run.outputs.overwrite)
+        elif run.beside.has_poses_on_map:
             raise ArgumentError(
-                f"{self.run.beside.poses}: poses on the map need GPS positions of {MIN_POSITIONS} images, in EXIF or a "
-                "file, or ground control points; choose another --frame, or another name"
+                f"{run.beside.poses}: poses on the map need a georeferenced output, and GPS positions of "
+                f"{MIN_POSITIONS} images or ground control points; choose another --frame, or another name"
             )
 
     def stage(self, result: StitchResult) -> list[Message]:

@@ -64,9 +64,10 @@ class Run:
             raise ArgumentError("reference and frame first both name the reference; leave one of them out")
         if beside.poses is not None:
             options = replace(options, pose_covariance=True)
+        has_poses = options.model == "auto" or MODELS[options.model].has_metric_poses
+        if not has_poses and (purpose.poses or beside.poses is not None or beside.map_server is not None):
+            raise ArgumentError(f"a {options.model} model has no poses; choose another one, such as tilting")
         if purpose.poses:
-            if options.model != "auto" and not MODELS[options.model].has_metric_poses:
-                raise ArgumentError(f"a {options.model} model has no path; choose another one, such as tilting")
             options = with_odometry_of_bag(given, options)
         known, notes = with_camera(options, given, of_bag=purpose is not Purpose.CALIBRATE)
         guard, outputs = InputGuard(options.strict), Outputs(options.overwrite)
