@@ -108,11 +108,7 @@ def apply_run(
         composite=composite,
         reference=saved.images[saved.reference].name,
         channel_order=options.channel_order,
-        workers=options.workers,
-        dry_run=options.dry_run,
-        topic=options.topic,
-        overwrite=options.overwrite,
-        strict=options.strict,
+        **options.of_run,
     )
     run = Run.of((), settings, output=output, every=options.every, progress=progress)
     return replace(run, read=[saved.path, *options.files, *settings.files])

@@ -104,11 +104,7 @@ def _tile_run(
     settings = StitchOptions(
         distortion=None if options.distortion == "auto" else options.distortion,
         composite=options.composite,
-        overwrite=options.overwrite,
-        strict=options.strict,
-        dry_run=options.dry_run,
-        workers=options.workers,
-        topic=options.topic,
+        **options.of_run,
     )
     run = Run.of((), settings, output=output, beside=beside, progress=progress)
     return replace(run, read=[*options.files, *settings.files])
