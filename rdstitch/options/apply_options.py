@@ -4,13 +4,7 @@ from dataclasses import dataclass
 
 from rdstitch.choices import MatchBy
 from rdstitch.options.option import documented, option
-from rdstitch.options.shared_options import (
-    ArrayChannels,
-    Every,
-    FlatField,
-    Mask,
-    RunOptions,
-)
+from rdstitch.options.shared_options import ArrayChannels, Every, FlatField, Mask, RunOptions
 
 
 @documented

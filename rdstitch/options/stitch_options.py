@@ -11,12 +11,7 @@ from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.estimation_options import EstimationOptions, RansacOptions
 from rdstitch.options.feature_options import FeatureOptions
 from rdstitch.options.option import Contradiction, Range, Unit, documented, option, reads, writes
-from rdstitch.options.shared_options import (
-    ArrayChannels,
-    Distortion,
-    Mask,
-    RunOptions,
-)
+from rdstitch.options.shared_options import ArrayChannels, Distortion, Mask, RunOptions
 from rdstitch.system.machine import processor_count
 
 if TYPE_CHECKING:

@@ -95,10 +95,7 @@ def tiles(
 
 
 def _tile_run(
-    options: TileOptions,
-    progress: Progress,
-    output: str | Path | None = None,
-    beside: FilesBeside = NOTHING_BESIDE,
+    options: TileOptions, progress: Progress, output: str | Path | None = None, beside: FilesBeside = NOTHING_BESIDE
 ) -> Run:
     """A run with what the stages after registration take of the options."""
     settings = StitchOptions(
@@ -241,11 +238,7 @@ def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
 
 
 def _write_beside(
-    outputs: Outputs,
-    file: str | Path | None,
-    options: TileOptions,
-    sources: Sequence[Source],
-    tiled: TileRegistration,
+    outputs: Outputs, file: str | Path | None, options: TileOptions, sources: Sequence[Source], tiled: TileRegistration
 ) -> None:
     """The table of places, and the flat field, where they are wanted."""
     if options.dry_run:
