@@ -70,19 +70,7 @@ def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canv
 def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas, Georeference | None, str]:
     """The canvas with its place on the Earth, and why it has none, or what contradicts it."""
     canvas = plan(placed, options)
-    place: Georeference | None
-    if options.georeference == "off":
-        place, reason = None, ""
-    elif placed.turned:
-        place, reason = None, "the camera turned on the spot"
-    else:
-        epsg = options.epsg if options.like is None else read_grid(options.like).place.crs.epsg
-        if placed.place is not None:
-            place, reason = placed.place.after(canvas.matrix), ""
-            if epsg is not None:
-                place = place.in_system(Crs(epsg), np.concatenate(canvas.footprints))
-        else:
-            place, reason = place_on_map(placed.located(canvas), epsg, force=options.georeference == "force")
+    place, reason = _place(placed, canvas, options)
     if place is None:
         for name in ("gsd", "like", "extent"):
             if getattr(options, name) is not None:
@@ -107,6 +95,19 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
     if (rotate, scale) != (options.rotate, options.scale):
         laid = plan(placed, replace(options, rotate=rotate, scale=scale, gsd=None))
     return laid, place_on_canvas(place, canvas, laid), reason
+
+
+def _place(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> tuple[Georeference | None, str]:
+    """The place of a canvas on the Earth, and why it has none, or what contradicts it."""
+    if options.georeference == "off":
+        return None, ""
+    if placed.turned:
+        return None, "the camera turned on the spot"
+    epsg = options.epsg if options.like is None else read_grid(options.like).place.crs.epsg
+    if placed.place is None:
+        return place_on_map(placed.located(canvas), epsg, force=options.georeference == "force")
+    place = placed.place.after(canvas.matrix)
+    return place if epsg is None else place.in_system(Crs(epsg), np.concatenate(canvas.footprints)), ""
 
 
 def _grid(options: CompositeOptions, place: Georeference) -> MapGrid | None:
