@@ -91,10 +91,6 @@ class CanvasOptions(UprightOptions):
         is_of_other_map = (new.like, new.epsg) != (self.like, self.epsg)
         return replace(new, extent=None) if is_of_other_map and "extent" not in given else new
 
-    def same_canvas(self, other: "CanvasOptions") -> bool:
-        """Whether other options give the output the same pixels."""
-        return all(getattr(self, each.name) == getattr(other, each.name) for each in fields(CanvasOptions))
-
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.like is not None:
