@@ -44,12 +44,7 @@ def mosaic_blocks(
     Returns
     -------
     tuple of StitchResult
-        The largest block first. Images that are left out are named in the first, if they are in no block.
-
-    Raises
-    ------
-    RdstitchError
-        As by :func:`rdstitch.mosaic`, where not even one block can be stitched.
+        The largest block first, without which there is an error. Images that are in no block are named in it.
     """
     file = Path(output)
     results: list[StitchResult] = []

@@ -117,20 +117,8 @@ def mosaic(
         Folders, images, patterns, ``@list`` files, videos, and arrays of shape (H, W) or (H, W, C), whose channels
         are in the order of ``options.channel_order``; see :func:`rdstitch.inputs.frame.as_inputs`. Images that cannot
         be read are left out by name.
-    output : path, optional
-        As for :func:`pano`.
-    options, every, progress, beside
-        As for :func:`pano`.
-
-    Returns
-    -------
-    StitchResult
-        The image or its file, with everything that was estimated.
-
-    Raises
-    ------
-    RdstitchError
-        See the tree in :mod:`rdstitch.errors`.
+    output, options, every, progress, beside
+        As for :func:`pano`, and so is what is returned and raised.
 
     Examples
     --------
@@ -191,11 +179,6 @@ def calibrate(
     -------
     Registration
         With the cameras and poses in ``alignment``.
-
-    Raises
-    ------
-    RdstitchError
-        See the tree in :mod:`rdstitch.errors`.
     """
     files = FilesBeside.of(ReportFile, beside, "calibrate")
     run = Run.of(inputs, options, Purpose.CALIBRATE, beside=files, every=every, progress=progress)
