@@ -296,10 +296,11 @@ def compose_registration(chosen: CandidateLayout, run: Run, plan: OutputPlan, ex
     registration, options, outputs = chosen.registration, run.options, run.outputs
     run_blocks = blocks_on(executor, chosen.plan.placed.sources, run.guard, options.cache)
     composed, messages = compose_images(chosen.plan, run, run_blocks)
+    stated = options if run.keeps_cache else replace(options, cache=None)
     result = StitchResult(
         registration=_release_images(registration, run).with_messages((*chosen.messages, *messages)),
         local_alignment=chosen.local,
-        **composed.fields | {"options": options.for_images(len(registration.sources))},
+        **composed.fields | {"options": stated.for_images(len(registration.sources))},
     )
     if options.dry_run:
         return result

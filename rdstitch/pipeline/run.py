@@ -40,6 +40,7 @@ class Run:
     notes: Sequence[Message] = ()  # on what is given besides the images
     progress: StageTimer = field(default_factory=StageTimer)  # it knows how long each stage took, for the report
     guard: InputGuard = field(default_factory=InputGuard)  # what all who read the input files notice of them
+    keeps_cache: bool = True  # whether the folder of the cache outlasts the run
     outputs: Outputs = field(default_factory=partial(Outputs, overwrite=False))  # what is staged
 
     @classmethod
@@ -72,7 +73,17 @@ class Run:
         known, notes = with_camera(options, given, of_bag=purpose is not Purpose.CALIBRATE)
         guard, outputs = InputGuard(options.strict), Outputs(options.overwrite)
         return cls(
-            known, file, beside, purpose, given, every, options.files, notes, StageTimer(progress), guard, outputs
+            known,
+            file,
+            beside,
+            purpose,
+            given,
+            every,
+            options.files,
+            notes,
+            StageTimer(progress),
+            guard,
+            outputs=outputs,
         )
 
     @contextmanager
