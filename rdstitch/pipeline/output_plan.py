@@ -105,10 +105,11 @@ class OutputPlan:
                 f"{MIN_POSITIONS} images or ground control points; choose another --frame, or another name"
             )
 
-    def stage(self, result: StitchResult) -> list[Message]:
-        """Stage what lies beside an image; a warning for each file that fails."""
-        attempts = (self.run.outputs.attempt(each.place, partial(each.stage, result)) for each in self.beside)
-        return [failure for failures in attempts for failure in failures]
+    def stage(self, result: StitchResult) -> StitchResult:
+        """Stage what lies beside an image; the result with a warning for each file that fails."""
+        for each in self.beside:
+            result = result.with_messages(self.run.outputs.attempt(each.place, partial(each.stage, result)))
+        return result
 
 
 def save_camera(registration: Registration, run: Run) -> None:

@@ -305,7 +305,7 @@ def compose_registration(chosen: CandidateLayout, run: Run, plan: OutputPlan, ex
     if options.dry_run:
         return result
     result = result.with_messages(write_page(result, outputs, partial(viewed_images, result)))
-    result = result.with_messages(plan.stage(result))
+    result = plan.stage(result)
     if run.output is not None:
         # Last: whoever finds it finds what it belongs to.
         from rdstitch.sidecar.write import sidecar  # and with it the forms of camera files, which no picture needs
