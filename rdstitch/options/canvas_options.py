@@ -83,6 +83,10 @@ class CanvasOptions(UprightOptions):
         replaced = {other for name in stated for each in self.contradictions for other in each.against(name)}
         if {"scale", "gsd"} & given.keys():
             replaced.add("max_size")  # it would reduce them
+        if given.get("georeference") == "off":
+            replaced |= {"gsd", "like", "extent"}
+        elif self.georeference == "off" and {"gsd", "like", "extent"} & stated:
+            replaced.add("georeference")
         changed: dict[str, Any] = {name: defaults[name] for name in replaced} | given
         new = replace(self, **changed)
         is_of_other_map = (new.like, new.epsg) != (self.like, self.epsg)
