@@ -178,14 +178,12 @@ def _files_beside(run: Run, names: Sequence[str]) -> Iterator[PlannedFile]:
 
 
 def _write_report(run: Run, file: Path, result: StitchResult | Registration) -> None:
-    # Imported late: most runs have none.
-    from rdstitch.report import write_report
+    from rdstitch.report import write_report  # most runs have none
 
     write_report(file, result, run.progress.stages, run.beside.command, outputs=run.outputs)
 
 
 def _write_hugin_project(file: Path, outputs: Outputs, result: StitchResult) -> None:
-    # Imported late: most runs have none.
-    from rdstitch.export.hugin_project import project_of_hugin
+    from rdstitch.export.hugin_project import project_of_hugin  # most runs have none
 
     outputs.write(file, text_bytes(project_of_hugin(result.registration, result.canvas)))
