@@ -27,10 +27,7 @@ def check_one_size(sources: Sequence[Source]) -> None:
 
 def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list[Source], list[Message]]:
     """The tiles, which are read without the illumination that all have; and what there is to say of that."""
-    from rdstitch.stage.estimate_flat_field import (
-        MIN_TILES,
-        estimate_illumination,
-    )  # images that are no tiles have none
+    from rdstitch.stage.estimate_flat_field import MIN_TILES, estimate_illumination  # for tiles only
 
     if wanted == "off":
         return list(sources), []
