@@ -32,11 +32,7 @@ Preview = Annotated[
         "given take precedence."
     ),
 ]
-STITCHING = [
-    *flags_of(StitchOptions, without="odometry"),
-    *flags_of(FeatureOptions),
-    *flags_of(CompositeOptions),
-]
+STITCHING = [*flags_of(StitchOptions, without="odometry"), *flags_of(FeatureOptions), *flags_of(CompositeOptions)]
 """The options of every command that composes the images that it registers."""
 
 

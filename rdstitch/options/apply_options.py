@@ -3,23 +3,13 @@
 from dataclasses import dataclass
 
 from rdstitch.choices import MatchBy
-from rdstitch.options.option import Options, documented, option
-from rdstitch.options.shared_options import (
-    ArrayChannels,
-    DryRun,
-    Every,
-    FlatField,
-    Mask,
-    Overwrite,
-    Strict,
-    Topic,
-    Workers,
-)
+from rdstitch.options.option import documented, option
+from rdstitch.options.shared_options import ArrayChannels, Every, FlatField, Mask, RunOptions
 
 
 @documented
 @dataclass(frozen=True)
-class ApplyOptions(Options):
+class ApplyOptions(RunOptions):
     """Options of :func:`rdstitch.apply`; the command line has the same names and defaults.
 
     Which image takes whose place says ``match``: "name", the one of the same file name, of the same name before the
@@ -32,10 +22,5 @@ class ApplyOptions(Options):
     )
     flat_field: FlatField = "off"
     every: Every = 1
-    topic: Topic = None
     mask: Mask = None
-    workers: Workers = 0
-    overwrite: Overwrite = False
-    strict: Strict = False
-    dry_run: DryRun = False
     channel_order: ArrayChannels = "bgr"

@@ -10,10 +10,6 @@ from rdstitch.options.option import Contradiction, Range, option, reads
 from rdstitch.options.upright_options import UprightOptions
 
 
-def _is_scalar(value: Any) -> bool:
-    return value is None or isinstance(value, str | int | float)
-
-
 @dataclass(frozen=True)
 class CanvasOptions(UprightOptions):
     """Which pixels the output has: images of the same places, composed with the same of these, lie on each other."""
@@ -82,18 +78,19 @@ class CanvasOptions(UprightOptions):
         """The same with other options; what is given takes the place of all that says the same in another way."""
         defaults = {each.name: each.default for each in fields(self)}
         # What turns nothing, crops nothing, or is left open contradicts nothing; scale=1 and straighten="off" do.
-        stated = [name for name, value in given.items() if not (_is_scalar(value) and value in (None, "none", 0.0))]
+        scalars = {name: value for name, value in given.items() if isinstance(value, str | int | float | None)}
+        stated = given.keys() - {name for name, value in scalars.items() if value in (None, "none", 0.0)}
         replaced = {other for name in stated for each in self.contradictions for other in each.against(name)}
         if {"scale", "gsd"} & given.keys():
             replaced.add("max_size")  # it would reduce them
+        if given.get("georeference") == "off":
+            replaced |= {"gsd", "like", "extent"}
+        elif self.georeference == "off" and {"gsd", "like", "extent"} & stated:
+            replaced.add("georeference")
         changed: dict[str, Any] = {name: defaults[name] for name in replaced} | given
         new = replace(self, **changed)
         is_of_other_map = (new.like, new.epsg) != (self.like, self.epsg)
         return replace(new, extent=None) if is_of_other_map and "extent" not in given else new
-
-    def same_canvas(self, other: "CanvasOptions") -> bool:
-        """Whether other options give the output the same pixels."""
-        return all(getattr(self, each.name) == getattr(other, each.name) for each in fields(CanvasOptions))
 
     def __post_init__(self) -> None:
         super().__post_init__()

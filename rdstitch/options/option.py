@@ -184,6 +184,10 @@ class Options:
         value, default = getattr(self, name), self.__dataclass_fields__[name].default
         return value is not None if default is None else bool(value != default)  # of an array, no truth is asked
 
+    def agrees(self, other: "Options", kind: type["Options"]) -> bool:
+        """Whether other options have the same values of all fields of a class that both are of."""
+        return all(getattr(self, each.name) == getattr(other, each.name) for each in fields(kind))
+
     @property
     def files(self) -> list[Path]:
         """The files that are read besides the images, none of which may be written over."""

@@ -1,10 +1,11 @@
 """Options that stand in several classes, or are parameters of several functions."""
 
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from rdstitch.choices import ChannelOrder
-from rdstitch.options.option import FileUse, Option, Range
+from rdstitch.options.option import FileUse, Option, Options, Range, option
 
 Every = Annotated[
     int | None,
@@ -33,12 +34,7 @@ FlatField = Annotated[
         file=FileUse.READ,
     ),
 ]
-Workers = Annotated[
-    int, Option("Threads; 0: one for each usable core.", "N", "-j --workers", within=Range(least=0, most=1024))
-]  # more than any machine has cores for
 Overwrite = Annotated[bool, Option("Replace existing output files.")]
-Strict = Annotated[bool, Option("Fail with status 5 when an image is left out.")]
-DryRun = Annotated[bool, Option("Print size, memory and time of compositing; write nothing.")]
 Height = Annotated[
     float | None,
     Option(
@@ -51,3 +47,25 @@ Distortion = Annotated[
     float | None,
     Option("Known λ (half-diagonal frame); it is not estimated.", "L", "--lambda", within=Range(above=-1.0, below=1.0)),
 ]
+
+
+@dataclass(frozen=True)
+class RunOptions(Options):
+    """What every recipe takes that makes an output."""
+
+    topic: Topic = None
+    workers: int = option(
+        0,
+        "Threads; 0: one for each usable core.",
+        "N",
+        "-j --workers",
+        within=Range(least=0, most=1024),  # more than any machine has cores for
+    )
+    overwrite: Overwrite = False
+    strict: bool = option(False, "Fail with status 5 when an image is left out.")
+    dry_run: bool = option(False, "Print size, memory and time of compositing; write nothing.")
+
+    @property
+    def of_run(self) -> dict[str, Any]:
+        """These options by name, for another recipe."""
+        return {each.name: getattr(self, each.name) for each in fields(RunOptions)}

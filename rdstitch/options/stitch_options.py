@@ -11,16 +11,7 @@ from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.estimation_options import EstimationOptions, RansacOptions
 from rdstitch.options.feature_options import FeatureOptions
 from rdstitch.options.option import Contradiction, Range, Unit, documented, option, reads, writes
-from rdstitch.options.shared_options import (
-    ArrayChannels,
-    Distortion,
-    DryRun,
-    Mask,
-    Overwrite,
-    Strict,
-    Topic,
-    Workers,
-)
+from rdstitch.options.shared_options import ArrayChannels, Distortion, Mask, RunOptions
 from rdstitch.system.machine import processor_count
 
 if TYPE_CHECKING:
@@ -33,7 +24,7 @@ _SELECT_MODEL_BELOW = 50
 
 @documented
 @dataclass(frozen=True)
-class StitchOptions(RansacOptions):
+class StitchOptions(RansacOptions, RunOptions):
     """How images are registered and composited.
 
     Raises :class:`rdstitch.errors.ArgumentError` where a value is out of range, unknown, or contradicts another one.
@@ -118,7 +109,6 @@ class StitchOptions(RansacOptions):
         (), "Exclude the image of this name, or all that match a pattern like 'img_49*'; repeatable.", "NAME"
     )
     include_only: tuple[str, ...] = option((), "Use only the images of this name or pattern; repeatable.", "NAME")
-    topic: Topic = None
     reference: str | None = option(None, "Reference image; otherwise the best connected one.", "NAME")
     pose_covariance: bool = option(
         False, "Compute covariances of the poses, for the sidecar and tables of poses.", flag=None
@@ -134,14 +124,11 @@ class StitchOptions(RansacOptions):
     cache: Path | None = option(
         None, "Folder for features, pairs and alignments, to reuse in later runs; made if missing.", "DIR"
     )
-    workers: Workers = 0
     scheduler: str | None = option(
         None,
         "Run on a Dask cluster that shares the images and the folder of --cache; local starts one here.",
         "ADDRESS|local",
     )
-    overwrite: Overwrite = False
-    strict: Strict = False
     force: bool = option(False, "Write the result even when it fails its own checks.")
     save_camera: Path | None = writes("Write the estimated camera.")
     camera_format: CameraFormat = option(
@@ -150,7 +137,6 @@ class StitchOptions(RansacOptions):
         ".pto (Hugin), .xml (lensfun), cameras.json (OpenDroneMap), cameras.txt (COLMAP), camera_info.yaml (ROS), "
         "camchain.yaml (Kalibr).",
     )
-    dry_run: DryRun = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

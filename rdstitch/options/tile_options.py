@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from rdstitch.choices import Origin, ScanOrder, ZPlane
 from rdstitch.errors import ArgumentError
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.options.option import Contradiction, Options, Range, documented, option, reads, writes
-from rdstitch.options.shared_options import DryRun, FlatField, Overwrite, Strict, Topic, Workers
+from rdstitch.options.option import Contradiction, Range, documented, option, reads, writes
+from rdstitch.options.shared_options import FlatField, RunOptions
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -22,7 +22,7 @@ def measured_samples() -> CompositeOptions:
 
 @documented
 @dataclass(frozen=True, eq=False)
-class TileOptions(Options):
+class TileOptions(RunOptions):
     """Options of :func:`rdstitch.tiles`; the command line has the same names and defaults.
 
     Besides a file, ``positions`` may be, of each tile in the order given, an array (N, 2) of x and y in pixels, or a
@@ -76,11 +76,6 @@ class TileOptions(Options):
         within=Range(above=-1.0, below=1.0),
     )
     composite: CompositeOptions = field(default_factory=measured_samples)
-    overwrite: Overwrite = False
-    strict: Strict = False
-    dry_run: DryRun = False
-    workers: Workers = 0
-    topic: Topic = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,6 +1,6 @@
 """How the output is turned between registration and canvas."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 from rdstitch.errors import ArgumentError
@@ -51,7 +51,3 @@ class UprightOptions(Options):
     def upright(self) -> bool:
         """Whether something in the scene shall be upright, whatever else the frame of the output would be."""
         return self.measured or self.straighten == "auto" or self.level
-
-    def same_turn(self, other: "UprightOptions") -> bool:
-        """Whether other options turn the output alike."""
-        return all(getattr(self, f.name) == getattr(other, f.name) for f in fields(UprightOptions))

@@ -1,12 +1,10 @@
 """Stage: check a registration; what fails a check is left out by name, and the rest is aligned anew."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
 from rdstitch.alignment.motion_models import MODELS
-from rdstitch.alignment.result import LinkFit, links_by_image
+from rdstitch.alignment.result import links_by_image
 from rdstitch.choices import ModelName
 from rdstitch.errors import PartialResultError
 from rdstitch.inputs.input_guard import InputGuard
@@ -130,21 +128,17 @@ def _worst(checked: _Checked) -> Rejected:
         pairs = [finding for finding in failures if finding.kind.scope is Scope.PAIR]
         said = zip(pairs, messages_of(pairs, registration), strict=True)
         return {finding.images: message.text for finding, message in said}
-    links = registration.alignment.holding
-    fit_share, links_of = agreement(links, len(registration.sources)), links_by_image(links)
+    links_of = links_by_image(registration.alignment.holding)
+
+    def agreement(image: int) -> float:
+        """Fraction of its matches that agree with the alignment of all; 1 without any."""
+        fits = links_of.get(image, [])
+        return sum(fit.inliers for fit in fits) / max(sum(fit.count for fit in fits), 1) if fits else 1.0
+
     chosen = dict[tuple[int, ...], str]()
-    beside: set[int] = set()
-    for image in sorted(single, key=lambda k: (fit_share[k], k)):
-        if image not in beside:
+    neighbours: set[int] = set()
+    for image in sorted(single, key=lambda k: (agreement(k), k)):
+        if image not in neighbours:
             chosen[image,] = messages_of([single[image]], registration)[0].text
-            beside |= {k for fit in links_of.get(image, []) for k in fit.images}
+            neighbours |= {k for fit in links_of.get(image, []) for k in fit.images}
     return chosen
-
-
-def agreement(links: Sequence[LinkFit], count: int) -> np.ndarray:
-    """Share of the matches of each image that agree with the alignment of all, shape (N,); 1 without any."""
-    given, kept = np.zeros(count), np.zeros(count)
-    for fit in links:
-        given[[fit.image1, fit.image2]] += fit.count
-        kept[[fit.image1, fit.image2]] += fit.inliers
-    return np.where(given > 0, kept / np.maximum(given, 1.0), 1.0)

@@ -162,10 +162,7 @@ class Aligner:
         return alignment.on_sphere or not len(every) or bool(np.mean(every < self.threshold) > _EXPLAINED)
 
     def _drafted(
-        self,
-        pairs: Sequence[PairRegistration],
-        known: KnownModel | None = None,
-        counted: frozenset[int] = frozenset(),
+        self, pairs: Sequence[PairRegistration], known: KnownModel | None = None, counted: frozenset[int] = frozenset()
     ) -> AlignedPairs:
         """The images aligned; near copies are placed afterwards, but for those that are ``counted`` as all are."""
         if not any(pair.relation for pair in pairs):

@@ -15,6 +15,7 @@ from rdstitch.inputs.frame import Frame, Images, as_inputs, files_of
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.matching.band_lens import BandLens, band_lens
 from rdstitch.options.apply_options import ApplyOptions
+from rdstitch.options.canvas_options import CanvasOptions
 from rdstitch.options.option import declared, options_of, with_fields
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.compose import CanvasPlan, compose_images
@@ -108,11 +109,7 @@ def apply_run(
         composite=composite,
         reference=saved.images[saved.reference].name,
         channel_order=options.channel_order,
-        workers=options.workers,
-        dry_run=options.dry_run,
-        topic=options.topic,
-        overwrite=options.overwrite,
-        strict=options.strict,
+        **options.of_run,
     )
     run = Run.of((), settings, output=output, every=options.every, progress=progress)
     return replace(run, read=[saved.path, *options.files, *settings.files])
@@ -161,7 +158,7 @@ def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: Co
     """The pixels of the saved output, where images of the same sizes are to have the same: bands, and dates."""
     matrix, size = saved.plane_to_output, saved.record.output.size
     same_sizes = all(saved.images[index].size == source.camera.image_size for index, source in used.items())
-    alike = same_sizes and not saved.turned and options.same_canvas(saved.composite)
+    alike = same_sizes and not saved.turned and options.agrees(saved.composite, CanvasOptions)
     place = saved.record.output.place
     return SavedGrid(matrix, size, place) if alike and matrix is not None and size is not None else None
 

@@ -79,13 +79,7 @@ def mosaic_bands(
         of_first = replace(images, frames=chosen[0])
         first = stitch_images(of_first, run, more_images=files[1:], more_files=stack)
         saved = replace(read_sidecar(outputs.where(f"{files[0]}.json")), path=Path(f"{files[0]}.json"))
-        same = ApplyOptions(
-            mask=options.mask,
-            overwrite=options.overwrite,
-            workers=options.workers,
-            strict=options.strict,
-            channel_order=options.channel_order,
-        )
+        same = ApplyOptions(mask=options.mask, channel_order=options.channel_order, **options.of_run)
         of_band = replace(apply_run(saved, None, saved.composite, same, progress), outputs=outputs)
         others = tuple(
             apply_to_images(saved, FoundImages(band, []), replace(of_band, output=name), same)

@@ -44,12 +44,7 @@ def mosaic_blocks(
     Returns
     -------
     tuple of StitchResult
-        The largest block first. Images that are left out are named in the first, if they are in no block.
-
-    Raises
-    ------
-    RdstitchError
-        As by :func:`rdstitch.mosaic`, where not even one block can be stitched.
+        The largest block first, without which there is an error. Images that are in no block are named in it.
     """
     file = Path(output)
     results: list[StitchResult] = []
@@ -64,7 +59,8 @@ def mosaic_blocks(
         )
         frames = selected(images.frames, options.exclude, options.include_only)
         names = [file, *(file.with_name(f"{file.stem}-{k}{file.suffix}") for k in range(2, len(frames) // 2 + 1))]
-        run = replace(run, options=replace(run.options, cache=cache, timestamps=None), notes=())
+        cached = replace(run.options, cache=cache, timestamps=None)
+        run = replace(run, options=cached, notes=(), keeps_cache=options.cache is not None)
         further = names[1:]
         remaining = replace(images, outputs=[], notes=())
         while len(frames) > 1 or not results:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -68,11 +69,12 @@ def follow(
         if not is_selected(arrived, options.exclude, options.include_only):
             continue
         frame = arrived if arrived.number is not None else replace(arrived, number=number)
-        source, image, reason = tracker.read(frame)
-        if (image is None or (source is not None and source.guard.messages)) and comes_again(arrived):
+        read = tracker.read(frame)
+        source = read.source
+        if (read.image is None or (source is not None and source.guard.messages)) and comes_again(arrived):
             unread[arrived.path] = number
             continue
-        poses_of_frame = tracker.register(frame, source, image, reason)
+        poses_of_frame = tracker.register(read)
         poses_of_frame[-1] = replace(poses_of_frame[-1], messages=(*poses_of_frame[-1].messages, *of_preview))
         yield from poses_of_frame
         of_preview = []
@@ -84,6 +86,15 @@ def follow(
     if live_preview is not None:
         with suppress(RdstitchError):  # what it was a preview of comes now
             live_preview.write()
+
+
+class ReadFrame(NamedTuple):
+    """A frame that arrived, as it is tracked."""
+
+    frame: Frame
+    source: Source | None = None
+    image: PreparedImage | None = None
+    problem: str = ""  # why there is no image
 
 
 class Tracker:
@@ -178,29 +189,28 @@ class Tracker:
             raise ArgumentError(f"image must be one image, not {len(more) + 1}")
         frame = replace(named, path=Path(f"image_{number:04d}")) if isinstance(named, Frame) else Frame(Path(named))
         frame = replace(frame, number=number, timestamp=time)
-        *revised, pose = self.register(frame, *self.read(frame, tilt), body)
+        *revised, pose = self.register(self.read(frame, tilt), body)
         self.revised = tuple(revised)
         return pose
 
-    def read(
-        self, frame: Frame, attitude: Sequence[float] | None = None
-    ) -> tuple[Source | None, PreparedImage | None, str]:
+    def read(self, frame: Frame, attitude: Sequence[float] | None = None) -> ReadFrame:
         """The frame as a source, and as it is tracked; or why it is not."""
         options, features = self._options, self._detection
         if options.timestamps is not None and (time := time_of(frame, options.timestamps)) is not None:
             frame = replace(frame, timestamp=time)
         sources, unread = read_frames([frame], options, InputGuard(options.strict), skip_bad=True)
         if not sources:
-            return None, None, unread[0].text
+            return ReadFrame(frame, problem=unread[0].text)
         source, megapixels = sources[0], self._megapixels
         try:
             if attitude is not None:
                 source = replace(source, attitude=_tilt(*attitude))
             (source,) = self._measured(source)
             view = source.view(megapixels)
-            return source, prepare(view, megapixels, stretch=features.stretch, equalize=bool(features.equalize)), ""
+            image = prepare(view, megapixels, stretch=features.stretch, equalize=bool(features.equalize))
+            return ReadFrame(frame, source, image)
         except InputError as error:
-            return source, None, str(error)
+            return ReadFrame(frame, source, problem=str(error))
 
     def _measured(self, source: Source) -> list[Source]:
         """The frame with its mask and attitude."""
@@ -208,16 +218,10 @@ class Tracker:
         (source,) = with_masks([source], options.mask, all_known=False)
         return [source] if source.attitude is not None else with_attitudes([source], options.attitude)
 
-    def register(
-        self,
-        frame: Frame,
-        source: Source | None,
-        image: PreparedImage | None,
-        reason: str,
-        body: BodyPose | None = None,
-    ) -> list[Pose]:
+    def register(self, read: ReadFrame, body: BodyPose | None = None) -> list[Pose]:
         """Register a frame that was read; it comes last, after those before it whose place is new."""
-        label = Pose(frame.name, frame.number or 0, math.nan, TrackingResult(), reason, self._poses)
+        source, image = read.source, read.image
+        label = Pose(read.frame.name, read.frame.number or 0, math.nan, TrackingResult(), read.problem, self._poses)
         if source is None or image is None:
             return [label]
         label = replace(label, name=source.name, timestamp=float(timestamps_of([source])[0]))

@@ -26,6 +26,8 @@ def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:
         read_grid(options.like)
     wanted = {"gsd": options.gsd, "crs": options.epsg, "like": options.like, "extent": options.extent}
     for name, value in wanted.items():
+        if value is not None and options.georeference == "off" and name != "crs":  # that is of positions too
+            raise ArgumentError(f"{name} needs a georeferenced output, but georeference is off; leave one of them out")
         if value is not None and not has_place(sources):
             raise ArgumentError(
                 f"{name} needs GPS positions of {MIN_POSITIONS} images, in EXIF or a file, or ground control points; "
@@ -68,24 +70,11 @@ def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canv
 def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas, Georeference | None, str]:
     """The canvas with its place on the Earth, and why it has none, or what contradicts it."""
     canvas = plan(placed, options)
-    place: Georeference | None
-    if options.georeference == "off":
-        place, reason = None, ""
-    elif placed.turned:
-        place, reason = None, "the camera turned on the spot"
-    else:
-        epsg = options.epsg if options.like is None else read_grid(options.like).place.crs.epsg
-        if placed.place is not None:
-            place, reason = placed.place.after(canvas.matrix), ""
-            if epsg is not None:
-                place = place.in_system(Crs(epsg), np.concatenate(canvas.footprints))
-        else:
-            force, to_output = options.georeference == "force", canvas.matrix @ placed.homographies
-            place, reason = place_on_map(placed.sources, to_output, placed.errors, epsg, force=force)
+    place, reason = _place(placed, canvas, options)
     if place is None:
         for name in ("gsd", "like", "extent"):
             if getattr(options, name) is not None:
-                raise ArgumentError(f"{name} needs a georeferenced output: {reason}; leave it out")
+                raise ArgumentError(f"{name} needs a georeferenced output: {reason or 'that is off'}; leave it out")
         return canvas, None, reason
     if placed.grid is not None:
         return canvas, placed.grid.place, reason
@@ -106,6 +95,20 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
     if (rotate, scale) != (options.rotate, options.scale):
         laid = plan(placed, replace(options, rotate=rotate, scale=scale, gsd=None))
     return laid, place_on_canvas(place, canvas, laid), reason
+
+
+def _place(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> tuple[Georeference | None, str]:
+    """The place of a canvas on the Earth, and why it has none, or what contradicts it."""
+    if options.georeference == "off":
+        return None, ""
+    if placed.turned:
+        return None, "the camera turned on the spot"
+    epsg = options.epsg if options.like is None else read_grid(options.like).place.crs.epsg
+    if placed.place is None:
+        to_output = canvas.matrix @ placed.homographies
+        return place_on_map(placed.sources, to_output, placed.errors, epsg, force=options.georeference == "force")
+    place = placed.place.after(canvas.matrix)
+    return place if epsg is None else place.in_system(Crs(epsg), np.concatenate(canvas.footprints)), ""
 
 
 def _grid(options: CompositeOptions, place: Georeference) -> MapGrid | None:

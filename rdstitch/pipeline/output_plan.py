@@ -27,7 +27,7 @@ _REPORT_SUFFIXES = (".html", ".htm")
 
 
 @dataclass(frozen=True)
-class FileBeside:
+class PlannedFile:
     """What is written beside an image, which is kept where this fails."""
 
     place: Path  # the file, or folder, that the user named
@@ -48,7 +48,7 @@ class OutputPlan:
     read: Sequence[str | Path]
     images: Sequence[Path] = ()
     files: Sequence[Path] = ()  # besides the images and what belongs to these
-    beside: Sequence[FileBeside] = ()
+    beside: Sequence[PlannedFile] = ()
     replaced_bag: Path | None = None  # folder that another bag takes the place of
 
     @classmethod
@@ -61,9 +61,8 @@ class OutputPlan:
         more_files: Sequence[Path] = (),
     ) -> Self:
         """Of a run over images of these names; ``more_images`` may follow its output."""
-        files = [*more_files, *_camera_file(run)]
         images = [*([] if run.output is None else [run.output]), *more_images]
-        return cls(run, [*inputs, *run.read], images, files, list(_files_beside(run, names)))
+        return cls(run, [*inputs, *run.read], images, more_files, list(_files_beside(run, names)))
 
     @classmethod
     def of_path(
@@ -96,19 +95,31 @@ class OutputPlan:
 
     def check_places(self, sources: Sequence[Source]) -> None:
         """The same of files that place images on the Earth, once it is known whether there will be any."""
-        if has_place(sources):
+        run = self.run
+        if run.options.composite.georeference != "off" and has_place(sources):
             files = [file for image in self.images for file in world_file_paths(image)]
-            check_outputs(files, self.run.outputs.overwrite)
-        elif self.run.beside.has_poses_on_map:
+            check_outputs(files, run.outputs.overwrite)
+        elif run.beside.has_poses_on_map:
             raise ArgumentError(
-                f"{self.run.beside.poses}: poses on the map need GPS positions of {MIN_POSITIONS} images, in EXIF or a "
-                "file, or ground control points; choose another --frame, or another name"
+                f"{run.beside.poses}: poses on the map need a georeferenced output, and GPS positions of "
+                f"{MIN_POSITIONS} images or ground control points; choose another --frame, or another name"
             )
 
-    def stage(self, result: StitchResult) -> list[Message]:
-        """Stage what lies beside an image; a warning for each file that fails."""
-        attempts = (self.run.outputs.attempt(each.place, partial(each.stage, result)) for each in self.beside)
-        return [failure for failures in attempts for failure in failures]
+    def stage(self, result: StitchResult) -> StitchResult:
+        """Stage what lies beside an image; the result with a warning for each file that fails."""
+        for each in self.beside:
+            result = result.with_messages(self.run.outputs.attempt(each.place, partial(each.stage, result)))
+        return result
+
+
+def save_camera(registration: Registration, run: Run) -> None:
+    """Stage the camera file, if one is wanted."""
+    options = run.options
+    if options.save_camera is not None:
+        from rdstitch.camera_files import camera_file_text
+
+        text = camera_file_text(registration.camera, options.save_camera, options.camera_format)
+        run.outputs.write(options.save_camera, text_bytes(text))
 
 
 def stage_report(run: Run, result: Registration) -> list[Message]:
@@ -140,39 +151,39 @@ def _image_files(output: Path) -> list[Path]:
     return [output, Path(f"{output}.json"), *([] if page is None else [page])]
 
 
-def _files_beside(run: Run, names: Sequence[str]) -> Iterator[FileBeside]:
+def _files_beside(run: Run, names: Sequence[str]) -> Iterator[PlannedFile]:
     """What is written beside an image of images with these names."""
     beside, outputs = run.beside, run.outputs
+    for camera in _camera_file(run):
+        yield PlannedFile(camera, lambda result: save_camera(result.registration, run))
     if (report := beside.report) is not None:
-        yield FileBeside(check_suffix(report, _REPORT_SUFFIXES), partial(_write_report, run, report))
+        yield PlannedFile(check_suffix(report, _REPORT_SUFFIXES), partial(_write_report, run, report))
     if (project := beside.hugin_project) is not None:
-        yield FileBeside(project, partial(_write_hugin_project, project, outputs))
+        yield PlannedFile(project, partial(_write_hugin_project, project, outputs))
     if (table := beside.poses) is not None:
         height = beside.height or 1.0
 
         def write_poses(result: StitchResult) -> None:
             outputs.write(table, text_bytes(poses_file(result, table, beside.frame, height)))
 
-        yield FileBeside(table, write_poses)
+        yield PlannedFile(table, write_poses)
     if (map_folder := beside.map_server) is not None:
         check_map_server(run.output, beside.height)
         write = partial(write_map, folder=map_folder, height=beside.height or 1.0, outputs=outputs)
-        yield FileBeside(map_folder, write, map_files(map_folder))
+        yield PlannedFile(map_folder, write, map_files(map_folder))
     if beside.layers is not None:
         layers = layer_files(names, beside.layers)
         stage = partial(stage_layers, files=layers, outputs=outputs, whole=beside.whole_layers)
-        yield FileBeside(beside.layers, stage, [file for pair in layers.values() for file in pair])
+        yield PlannedFile(beside.layers, stage, [file for pair in layers.values() for file in pair])
 
 
 def _write_report(run: Run, file: Path, result: StitchResult | Registration) -> None:
-    # Imported late: most runs have none.
-    from rdstitch.report import write_report
+    from rdstitch.report import write_report  # most runs have none
 
     write_report(file, result, run.progress.stages, run.beside.command, outputs=run.outputs)
 
 
 def _write_hugin_project(file: Path, outputs: Outputs, result: StitchResult) -> None:
-    # Imported late: most runs have none.
-    from rdstitch.export.hugin_project import project_of_hugin
+    from rdstitch.export.hugin_project import project_of_hugin  # most runs have none
 
     outputs.write(file, text_bytes(project_of_hugin(result.registration, result.canvas)))

@@ -29,7 +29,7 @@ from rdstitch.pipeline.choose_layout import choose_layout
 from rdstitch.pipeline.compose import compose_images
 from rdstitch.pipeline.lay_out import CandidateLayout
 from rdstitch.pipeline.map_canvas import check_map
-from rdstitch.pipeline.output_plan import OutputPlan, report_refused, stage_report
+from rdstitch.pipeline.output_plan import OutputPlan, report_refused, save_camera, stage_report
 from rdstitch.pipeline.read_inputs import in_order, read_inputs
 from rdstitch.pipeline.realign import aligner_of, with_reference_of
 from rdstitch.pipeline.register import register
@@ -117,20 +117,8 @@ def mosaic(
         Folders, images, patterns, ``@list`` files, videos, and arrays of shape (H, W) or (H, W, C), whose channels
         are in the order of ``options.channel_order``; see :func:`rdstitch.inputs.frame.as_inputs`. Images that cannot
         be read are left out by name.
-    output : path, optional
-        As for :func:`pano`.
-    options, every, progress, beside
-        As for :func:`pano`.
-
-    Returns
-    -------
-    StitchResult
-        The image or its file, with everything that was estimated.
-
-    Raises
-    ------
-    RdstitchError
-        See the tree in :mod:`rdstitch.errors`.
+    output, options, every, progress, beside
+        As for :func:`pano`, and so is what is returned and raised.
 
     Examples
     --------
@@ -163,7 +151,7 @@ def stitch_images(
     known = [*unread, *images.messages, *run.notes]
     with run.executor(len(sources)) as executor:
         with _failures_explained(run, known):
-            accepted, run = _accepted(sources, known, run, executor)
+            accepted, run = _register_and_check(sources, known, run, executor)
             run.progress("laying out", 0, 1)
             chosen = choose_layout(accepted, run.options, aligner_of(accepted, run.options, run.purpose))
         return compose_registration(chosen, run, plan, executor)
@@ -191,18 +179,13 @@ def calibrate(
     -------
     Registration
         With the cameras and poses in ``alignment``.
-
-    Raises
-    ------
-    RdstitchError
-        See the tree in :mod:`rdstitch.errors`.
     """
     files = FilesBeside.of(ReportFile, beside, "calibrate")
     run = Run.of(inputs, options, Purpose.CALIBRATE, beside=files, every=every, progress=progress)
     with run.open_images() as images:
         OutputPlan.of_images(run, images.files).check()
-        result = _registered(images, run)
-        _save_camera(result, run)
+        result = _register_at_full_size(images, run)
+        save_camera(result, run)
         return result.with_messages(stage_report(run, result))
 
 
@@ -253,27 +236,27 @@ def trajectory(
         odometry = as_odometry(run.options.odometry)
         numbers = frame_numbers(images.frames)
         numbered = [replace(frame, number=k) for frame, k in zip(images.frames, numbers, strict=True)]
-        registration = _registered(replace(images, frames=numbered), run)
+        registration = _register_at_full_size(replace(images, frames=numbered), run)
         path, messages = camera_path(registration, odometry, height)
         if layout in ("tum", "bag") and not has_times(path):
             messages.append(_NO_TIMES)
         if output is not None:
             write_trajectory(path, Path(output), layout, frame, run.outputs)
-        _save_camera(registration, run)
+        save_camera(registration, run)
         if plot is not None:
             drawn = text_bytes(path_as_svg(path, "heights" if height is None else "m"))
             messages += run.outputs.attempt(plot, partial(run.outputs.write, plot, drawn))
         return path, registration.with_messages(messages)
 
 
-def _registered(images: FoundImages, run: Run) -> Registration:
+def _register_at_full_size(images: FoundImages, run: Run) -> Registration:
     """The registration of images that were found, in pixels of their full size."""
     frames = with_times(images.frames, run.options.timestamps)
     sources, unread = read_inputs(frames, run.options, run.guard, skip_bad=True)
     known = [*unread, *images.messages, *run.notes]
     with run.executor(len(sources)) as executor, _failures_explained(run, known):
-        accepted, _ = _accepted(sources, known, run, executor)
-    return _finished(at_full_size(accepted), run)
+        accepted, _ = _register_and_check(sources, known, run, executor)
+    return _release_images(at_full_size(accepted), run)
 
 
 @contextmanager
@@ -290,7 +273,7 @@ def _failures_explained(run: Run, known: Sequence[Message]) -> Iterator[None]:
         raise
 
 
-def _accepted(
+def _register_and_check(
     sources: Sequence[Source], known: Sequence[Message], run: Run, executor: Executor
 ) -> tuple[Registration, Run]:
     """Register and check, in pixels of the working size.
@@ -313,17 +296,16 @@ def compose_registration(chosen: CandidateLayout, run: Run, plan: OutputPlan, ex
     registration, options, outputs = chosen.registration, run.options, run.outputs
     run_blocks = blocks_on(executor, chosen.plan.placed.sources, run.guard, options.cache)
     composed, messages = compose_images(chosen.plan, run, run_blocks)
+    stated = options if run.keeps_cache else replace(options, cache=None)
     result = StitchResult(
-        registration=_finished(registration, run).with_messages((*chosen.messages, *messages)),
+        registration=_release_images(registration, run).with_messages((*chosen.messages, *messages)),
         local_alignment=chosen.local,
-        **composed.fields | {"options": options.for_images(len(registration.sources))},
+        **composed.fields | {"options": stated.for_images(len(registration.sources))},
     )
     if options.dry_run:
         return result
-    failed = outputs.attempt(options.save_camera or "", partial(_save_camera, registration, run))
-    failed += write_page(result, outputs, partial(viewed_images, result))
-    result = result.with_messages(failed)
-    result = result.with_messages(plan.stage(result))
+    result = result.with_messages(write_page(result, outputs, partial(viewed_images, result)))
+    result = plan.stage(result)
     if run.output is not None:
         # Last: whoever finds it finds what it belongs to.
         from rdstitch.sidecar.write import sidecar  # and with it the forms of camera files, which no picture needs
@@ -332,17 +314,8 @@ def compose_registration(chosen: CandidateLayout, run: Run, plan: OutputPlan, ex
     return result
 
 
-def _finished(registration: Registration, run: Run) -> Registration:
+def _release_images(registration: Registration, run: Run) -> Registration:
     """Images kept for stages that will not come are let go; what the decoders found wrong, in any stage, is added."""
     for source in registration.sources:
         source.decoded_images.clear()
     return registration.with_messages(run.guard.messages)
-
-
-def _save_camera(registration: Registration, run: Run) -> None:
-    options = run.options
-    if options.save_camera is not None:
-        from rdstitch.camera_files import camera_file_text
-
-        text = camera_file_text(registration.camera, options.save_camera, options.camera_format)
-        run.outputs.write(options.save_camera, text_bytes(text))

@@ -50,12 +50,7 @@ def read_replacements(
     if options.flat_field != "off":
         check_one_size(used)
         used, illumination = with_flat_field(used, options.flat_field)
-    return Replacements(
-        dict(zip(sources, used, strict=True)),
-        missing,
-        matched,
-        [*messages, *unmatched, *illumination],
-    )
+    return Replacements(dict(zip(sources, used, strict=True)), missing, matched, [*messages, *unmatched, *illumination])
 
 
 def _read(

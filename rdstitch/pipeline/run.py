@@ -40,6 +40,7 @@ class Run:
     notes: Sequence[Message] = ()  # on what is given besides the images
     progress: StageTimer = field(default_factory=StageTimer)  # it knows how long each stage took, for the report
     guard: InputGuard = field(default_factory=InputGuard)  # what all who read the input files notice of them
+    keeps_cache: bool = True  # whether the folder of the cache outlasts the run
     outputs: Outputs = field(default_factory=partial(Outputs, overwrite=False))  # what is staged
 
     @classmethod
@@ -64,14 +65,25 @@ class Run:
             raise ArgumentError("reference and frame first both name the reference; leave one of them out")
         if beside.poses is not None:
             options = replace(options, pose_covariance=True)
+        has_poses = options.model == "auto" or MODELS[options.model].has_metric_poses
+        if not has_poses and (purpose.poses or beside.poses is not None or beside.map_server is not None):
+            raise ArgumentError(f"a {options.model} model has no poses; choose another one, such as tilting")
         if purpose.poses:
-            if options.model != "auto" and not MODELS[options.model].has_metric_poses:
-                raise ArgumentError(f"a {options.model} model has no path; choose another one, such as tilting")
             options = with_odometry_of_bag(given, options)
         known, notes = with_camera(options, given, of_bag=purpose is not Purpose.CALIBRATE)
         guard, outputs = InputGuard(options.strict), Outputs(options.overwrite)
         return cls(
-            known, file, beside, purpose, given, every, options.files, notes, StageTimer(progress), guard, outputs
+            known,
+            file,
+            beside,
+            purpose,
+            given,
+            every,
+            options.files,
+            notes,
+            StageTimer(progress),
+            guard,
+            outputs=outputs,
         )
 
     @contextmanager

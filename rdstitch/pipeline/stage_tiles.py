@@ -96,20 +96,13 @@ def tiles(
 
 
 def _tile_run(
-    options: TileOptions,
-    progress: Progress,
-    output: str | Path | None = None,
-    beside: FilesBeside = NOTHING_BESIDE,
+    options: TileOptions, progress: Progress, output: str | Path | None = None, beside: FilesBeside = NOTHING_BESIDE
 ) -> Run:
     """A run with what the stages after registration take of the options."""
     settings = StitchOptions(
         distortion=None if options.distortion == "auto" else options.distortion,
         composite=options.composite,
-        overwrite=options.overwrite,
-        strict=options.strict,
-        dry_run=options.dry_run,
-        workers=options.workers,
-        topic=options.topic,
+        **options.of_run,
     )
     run = Run.of((), settings, output=output, beside=beside, progress=progress)
     return replace(run, read=[*options.files, *settings.files])
@@ -244,11 +237,7 @@ def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
 
 
 def _write_beside(
-    outputs: Outputs,
-    file: str | Path | None,
-    options: TileOptions,
-    sources: Sequence[Source],
-    tiled: TileRegistration,
+    outputs: Outputs, file: str | Path | None, options: TileOptions, sources: Sequence[Source], tiled: TileRegistration
 ) -> None:
     """The table of places, and the flat field, where they are wanted."""
     if options.dry_run:

@@ -67,7 +67,7 @@ def reoriented(
     placed: PlacedImages, options: CompositeOptions, former: UprightOptions
 ) -> tuple[PlacedImages, list[Message]]:
     """Images that former options have turned, as other options turn them, and what the user should know of it."""
-    if options.same_turn(former):
+    if options.agrees(former, UprightOptions):
         return placed, []
     if placed.orientation is not None:
         homographies = np.linalg.inv(placed.orientation) @ placed.homographies
@@ -184,14 +184,6 @@ def _by_lines(reference: _Reference, ends: FloatArray) -> Upright:
     return of_edges(edges, nearest_axis(edges, start[:2], focal.value), start, focal, focal.value)
 
 
-def _by_gravity(reference: _Reference) -> tuple[Upright | None, Message | None]:
-    """By what was measured to be down, or is down in most images."""
-    if reference.placed.turned:
-        return None, Message("the horizon of a panorama is level already", severity="note")
-    upright = _level(reference)
-    return upright, Message("the camera looks straight down: there is nothing to level") if upright is None else None
-
-
 def _detected_edges(reference: _Reference) -> Edges:
     """Straight edges in the images."""
     placed, to_reference = reference.placed, reference.from_images
@@ -205,8 +197,10 @@ def _detected_edges(reference: _Reference) -> Edges:
     return reference.edges(np.concatenate(segments), error)
 
 
-def _level(reference: _Reference) -> Upright | None:
-    """With what is down in the scene, or else in most images, down in the output; None where that is ahead."""
+def _by_gravity(reference: _Reference) -> tuple[Upright | None, Message | None]:
+    """By what was measured to be down, or is down in most images; None where the output is level, or that is ahead."""
+    if reference.placed.turned:
+        return None, Message("the horizon of a panorama is level already", severity="note")
     calibration = np.diag([1.0, 1.0, reference.focal.value])
     measured = [source.down for source in reference.placed.sources]
     known = any(down is not None for down in measured)
@@ -219,9 +213,9 @@ def _level(reference: _Reference) -> Upright | None:
     down /= np.linalg.norm(down)
     ahead = reference.start[2]
     if abs(down @ ahead) > _STEEP:
-        return None
+        return None, Message("the camera looks straight down: there is nothing to level")
     if not known:
         down -= (down @ ahead) * ahead
         down /= np.linalg.norm(down)
     right = np.cross(down, ahead)
-    return Upright(np.stack([right / np.linalg.norm(right), down]), reference.focal)
+    return Upright(np.stack([right / np.linalg.norm(right), down]), reference.focal), None

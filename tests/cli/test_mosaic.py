@@ -122,6 +122,11 @@ def test_all_blocks_are_planned_first_and_published_together(rdstitch: Run, fold
     assert {file.name for file in tmp_path.iterdir()} == {"flight", *names}
 
 
+def test_a_cache_that_blocks_have_for_themselves_is_no_option(rdstitch: Run, place: Path) -> None:
+    rdstitch("mosaic", place, "-o", place / "out.png", "--all-blocks", *FAST)
+    assert sidecar_of(place / "out.png")["options"]["cache"] is None
+
+
 def test_a_block_that_cannot_be_laid_out_is_told_of(
     rdstitch: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -210,8 +210,20 @@ def test_an_earlier_page_is_older(
     assert "the file of this name is older" in rdstitch(*arguments).err
 
 
-def test_a_map_that_cannot_be_made_leaves_nothing(rdstitch: Run, located: Path, tmp_path: Path) -> None:
-    arguments = ("mosaic", located / "flight", "-o", tmp_path / "field.png", "--model", "homography", *FAST)
+def test_without_georeference_no_place_is_written_or_asked_for(rdstitch: Run, located: Path, tmp_path: Path) -> None:
+    (tmp_path / "field.jgw").write_text("mine")
+    arguments = ("mosaic", located / "flight", "-o", tmp_path / "field.jpg", "--georeference", "off", *CACHED)
+    rdstitch(*arguments, "--gsd", "0.1", status=2, told="gsd needs a georeferenced output, but georeference is off")
+    rdstitch(*arguments, "--poses", tmp_path / "p.csv", "--frame", "map", status=2, told="poses on the map need")
+    rdstitch(*arguments)
+    assert (tmp_path / "field.jgw").read_text() == "mine"
+
+
+def test_a_map_that_cannot_be_made_leaves_nothing(
+    rdstitch: Run, located: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rdstitch.export.map_server._pixel_to_metres", lambda *_: 1 // 0)
+    arguments = ("mosaic", located / "flight", "-o", tmp_path / "field.png", *FAST)
     done = rdstitch(*arguments, "--map-server", tmp_path / "map", "--height", "9", told="map: not written")
     assert "is older" not in done.err
     assert not (tmp_path / "map").exists()

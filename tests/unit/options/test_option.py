@@ -129,6 +129,8 @@ def test_arrays_become_tuples_of_numbers() -> None:
         ({"like": "a.tif", "extent": (0, 0, 1, 1)}, {"like": Path("a.tif")}, {}),
         ({"max_size": 1200}, {"extent": np.array([0, 0, 1, 1])}, {"max_size": None}),
         ({"gsd": 0.1}, {"scale": 1.0}, {"gsd": None}),
+        ({"gsd": 0.1}, {"georeference": "off"}, {"gsd": None}),
+        ({"georeference": "off"}, {"gsd": 0.1}, {"georeference": "auto"}),
         ({"rectangle": (0, 0, 9, 0, 9, 9, 0, 9)}, {"straighten": "off"}, {"rectangle": None}),
         ({"level": True}, {"straighten": "auto"}, {"level": False}),
     ],

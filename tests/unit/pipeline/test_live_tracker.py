@@ -258,7 +258,7 @@ def test_masks_lie_in_folders_as_their_frames_do(tmp_path: Path, monkeypatch: py
     tracker = rdstitch.Tracker(rdstitch.StitchOptions(mask=tmp_path / "masks"))
     listed = Mock(side_effect=os.walk)
     monkeypatch.setattr("rdstitch.inputs.masks.os.walk", listed)
-    source, _, _ = tracker.read(Frame(tmp_path / "frames" / "east" / "f.png", label="east/f.png"))
+    source = tracker.read(Frame(tmp_path / "frames" / "east" / "f.png", label="east/f.png")).source
     assert source is not None
     assert source.mask is not None
     assert source.mask.path == tmp_path / "masks" / "east" / "f.png"
