@@ -98,7 +98,7 @@ _COEFFICIENTS = {False: ("k1", "k2", "p1", "p2", "k3"), True: ("k1", "k2", "k3",
 class _OpenDroneMap(Struct, kw_only=True):
     """Lens models of OpenSfM, with lengths in units of the longer side."""
 
-    projection_type: Literal["perspective", "brown", "simple_radial", "radial", "fisheye_opencv"]
+    projection_type: Literal["perspective", "brown", "simple_radial", "radial", "fisheye", "fisheye_opencv"]
     width: Side
     height: Side
     focal: float | None = None
@@ -126,7 +126,7 @@ def read_opendronemap(entry: Any, file: str, name: str) -> CameraFile:
     fx, fy = (record.focal or value or 0.0 for value in (record.focal_x, record.focal_y))
     focal = (fx * longer, fy * longer)
     center = ((size[0] - 1) / 2 + record.c_x * longer, (size[1] - 1) / 2 + record.c_y * longer)
-    fisheye = record.projection_type == "fisheye_opencv"
+    fisheye = record.projection_type.startswith("fisheye")  # they differ by how many coefficients they have
     k = tuple(getattr(record, name) for name in _COEFFICIENTS[fisheye])
     return fitted_camera(LensModel(focal, center, k, kind_of(fisheye)), "OpenDroneMap", size)
 
