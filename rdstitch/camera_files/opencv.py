@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
+from rdstitch.camera_files.embedded_camera import FIELD, Written, as_yaml, comments, embedded_camera
 from rdstitch.camera_files.lens_models import (
     FISHEYE,
     POLYNOMIAL,
@@ -19,7 +20,6 @@ from rdstitch.camera_files.lens_models import (
     kind_of,
     nearest_model,
 )
-from rdstitch.camera_files.own_record import OWN, Written, as_yaml, comments, own_record
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
@@ -161,7 +161,7 @@ def opencv_text(camera: Camera, *, yaml: bool = True, fisheye: bool = False) -> 
     """
     lens, fit, _ = nearest_model(camera, {FISHEYE: ""} if fisheye else {POLYNOMIAL: "", RATIONAL: ""})
     mark = {"fisheye_model": 1} if fisheye else {}
-    content = {**_calibration(camera, lens, **mark), OWN: own_record(camera, fit)}
+    content = {**_calibration(camera, lens, **mark), FIELD: embedded_camera(camera, fit)}
     return "%YAML:1.0\n---\n" + as_yaml(content) if yaml else json.dumps(content, indent=4) + "\n", fit
 
 

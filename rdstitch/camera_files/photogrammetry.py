@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
+from rdstitch.camera_files.embedded_camera import FIELD, Written, as_yaml, comments, embedded_camera
 from rdstitch.camera_files.lens_models import (
     FISHEYE,
     POLYNOMIAL,
@@ -18,7 +19,6 @@ from rdstitch.camera_files.lens_models import (
     kind_of,
     nearest_model,
 )
-from rdstitch.camera_files.own_record import OWN, Written, as_yaml, comments, own_record
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
@@ -145,7 +145,7 @@ def opendronemap_json(camera: Camera) -> Written:
         "c_x": (lens.center[0] - (width - 1) / 2) / longer,
         "c_y": (lens.center[1] - (height - 1) / 2) / longer,
         **dict(zip(_COEFFICIENTS[lens.fisheye], lens.coefficients, strict=True)),
-        OWN: own_record(camera, fit),
+        FIELD: embedded_camera(camera, fit),
     }
     return json.dumps({f"v2 unknown unknown {width} {height} {kind} {fx:.4g}": entry}, indent=4) + "\n", fit
 

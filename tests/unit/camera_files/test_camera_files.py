@@ -424,7 +424,7 @@ def test_what_others_know_and_rdstitch_does_not_is_named(tmp_path: Path, text: s
         ("cameras.json", '"width": 4000', '"width": 1' + 400 * "0", "width"),
         ("c.pto", "i w4000", "i w4e30", "w: "),
         ("cameras.json", '"focal_x": ', '"focal_x": 1e308, "x": ', "focal length"),
-        ("cameras.json", '"fisheye_opencv",', '"fisheye",', "projection_type"),
+        ("cameras.json", '"fisheye_opencv",', '"fisheye62",', "projection_type"),
         ("cameras.json", '"focal_x"', '"focal_z"', "focal_x"),
         ("cameras.json", '"k1": ', '"k1": 1', "folds"),
         ("c.pto", " f3 v", " f4 v", "fisheye"),
