@@ -76,7 +76,7 @@ class PlacedImages:
             ),
         )
 
-    @property
+    @cached_property
     def cameras(self) -> list[Camera]:
         """Those of the images."""
         return [source.camera for source in self.sources]
