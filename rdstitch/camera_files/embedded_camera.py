@@ -26,7 +26,10 @@ def embedded_camera(camera: Camera, fit: LensFit) -> dict[str, Any]:
 
 
 def as_yaml(content: dict[str, Any], *, opencv: bool = True) -> str:
-    """Write numbers, texts, lists and one level of objects; with OpenCV's marks, which other readers do not know."""
+    """Write numbers, texts, lists and one level of objects; with OpenCV's marks, which other readers do not know.
+
+    What PyYAML makes of lists of lists OpenCV cannot read.
+    """
     lines = []
     for key, value in content.items():
         if not isinstance(value, dict):
