@@ -10,9 +10,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
+from rdstitch.camera_files.embedded_camera import COMMENT, FIELD
 from rdstitch.camera_files.lens_models import CameraFile, LensFit
 from rdstitch.camera_files.opencv import ImageSize, camera_info_yaml, is_opencv, opencv_text, read_opencv
-from rdstitch.camera_files.own_record import OWN, OWN_COMMENT
 from rdstitch.camera_files.photogrammetry import (
     camera_chain_yaml,
     colmap_cameras,
@@ -78,9 +78,9 @@ def read_camera_file(path: str | Path, image_size: ImageSize | None = None) -> C
     with _naming(file):
         if text.lstrip().startswith("{"):
             return _of_content(parse_json(text, file), file, image_size)
-        own = next((line for line in text.splitlines() if line.startswith(OWN_COMMENT)), None)
-        if own is not None:
-            return _own(parse_json(own.removeprefix(OWN_COMMENT), file), file)
+        embedded = next((line for line in text.splitlines() if line.startswith(COMMENT)), None)
+        if embedded is not None:
+            return _of_record(parse_json(embedded.removeprefix(COMMENT), file), file)
         if text.lstrip().startswith("<"):
             return read_lensfun(text, file, image_size)
         if is_hugin(text):
@@ -108,17 +108,17 @@ def _naming(file: str) -> Iterator[None]:
 def _of_content(content: Any, file: str, image_size: ImageSize | None) -> CameraFile:
     """The camera of plain values, whosever they are."""
     if is_opencv(content):
-        own = content.get(OWN)
-        return read_opencv(content, file, image_size) if own is None else _own(own, file, OWN)
+        embedded = content.get(FIELD)
+        return read_opencv(content, file, image_size) if embedded is None else _of_record(embedded, file, FIELD)
     entries = content.items() if isinstance(content, dict) else ()
     for key, read in (("projection_type", read_opendronemap), ("camera_model", read_kalibr)):
         if matching := [(name, entry) for name, entry in entries if isinstance(entry, dict) and key in entry]:
             name, entry = _only(matching)
-            own = entry.get(OWN)
-            return read(entry, file, str(name)) if own is None else _own(own, file, f"{name}.{OWN}")
+            embedded = entry.get(FIELD)
+            return read(entry, file, str(name)) if embedded is None else _of_record(embedded, file, f"{name}.{FIELD}")
     if "format" not in dict(entries):
         raise ArgumentError("is no camera file of a known format")
-    return _own(content, file)
+    return _of_record(content, file)
 
 
 def _only(cameras: Sequence[Value]) -> Value:
@@ -127,7 +127,7 @@ def _only(cameras: Sequence[Value]) -> Value:
     return cameras[0]
 
 
-def _own(content: Any, file: str, field: str = "") -> CameraFile:
+def _of_record(content: Any, file: str, field: str = "") -> CameraFile:
     """What rdstitch wrote, alone or into the file of others."""
     return CameraFile(convert(content, CameraRecord, file, field, strict=False).camera(), "rdstitch")
 

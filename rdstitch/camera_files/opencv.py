@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
+from rdstitch.camera_files.embedded_camera import FIELD, Written, as_yaml, comments, embedded_camera
 from rdstitch.camera_files.lens_models import (
     FISHEYE,
     POLYNOMIAL,
@@ -19,7 +20,6 @@ from rdstitch.camera_files.lens_models import (
     kind_of,
     nearest_model,
 )
-from rdstitch.camera_files.own_record import OWN, Written, as_yaml, comments, own_record
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
@@ -63,12 +63,36 @@ class _OpenCV(Struct, kw_only=True):
     distortion_model: Literal["plumb_bob", "rational_polynomial", "equidistant", "fisheye"] | None = None
     fisheye_model: Count | None = None
 
+    def __post_init__(self) -> None:
+        matrix, k = self.camera_matrix, self.coefficients
+        if (matrix.rows, matrix.cols) != (3, 3):
+            raise ValueError("camera_matrix: expected 3 rows of 3")
+        fx, skew, _, _, fy = matrix.data[:5]
+        if not (fx > 0.0 and fy > 0.0 and abs(skew) < 1e-6 * fx):
+            raise ValueError("camera_matrix: expected positive focal lengths and no skew")
+        if self.is_fisheye and len(k) != 4:
+            raise ValueError("distortion_coefficients: expected the 4 coefficients of a fisheye")
+        if len(k) not in (0, 4, 5, 8, 12, 14) or any(k[8:]):
+            raise ValueError(
+                "distortion_coefficients: expected 4, 5 or 8; thin prisms and tilted sensors are not known here"
+            )
+
     @property
     def is_fisheye(self) -> bool | None:
         """Whether the coefficients are those of the fisheye model; None where nothing says."""
         if self.distortion_model is not None:
             return self.distortion_model in ("equidistant", "fisheye")
         return None if self.fisheye_model is None else self.fisheye_model > 0
+
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """Those of the distortion."""
+        return tuple(self.distortion_coefficients.data)
+
+    def lens(self, *, fisheye: bool) -> LensModel:
+        """The lens, if its coefficients are those of the fisheye model, or of Brown's."""
+        fx, _, cx, _, fy, cy = self.camera_matrix.data[:6]
+        return LensModel((fx, fy), (cx, cy), self.coefficients[:8], kind_of(fisheye))
 
 
 def is_opencv(content: Any) -> bool:
@@ -82,40 +106,14 @@ def read_opencv(content: dict[str, Any], file: str, image_size: ImageSize | None
     Four coefficients may be Brown's or those of ``cv2.fisheye``, and only a mark says which. Where there is none they
     are Brown's, unless they clearly make a fisheye.
     """
-    named = {_ALIASES.get(name, name): value for name, value in content.items()}
-    for name, rows in (("camera_matrix", 3), ("distortion_coefficients", 1)):
-        given = named.get(name)
-        shape = given if isinstance(given, dict) else {}
-        if isinstance(data := shape.get("data", given), list):  # as ``ros2 topic echo`` prints them; or row by row
-            values = [value for row in data for value in (row if isinstance(row, list) else [row])]
-            named[name] = {"rows": rows, "cols": len(values) // rows, **shape, "data": values}
-        elif name in named and not shape:
-            raise ArgumentError(f"{name}: expected rows, cols and data, or a list of numbers")
-    if named.get("distortion_model") == "":
-        raise ArgumentError("distortion_model: is empty, as of a camera that is not calibrated")
-    record = convert(named, _OpenCV, file, strict=False)
-    matrix, k = record.camera_matrix, tuple(record.distortion_coefficients.data)
-    if (matrix.rows, matrix.cols) != (3, 3):
-        raise ArgumentError("camera_matrix: expected 3 rows of 3")
-    fx, skew, cx, _, fy, cy = matrix.data[:6]
-    if not (fx > 0.0 and fy > 0.0 and abs(skew) < 1e-6 * fx):
-        raise ArgumentError("camera_matrix: expected positive focal lengths and no skew")
-    size = _size(record, (cx, cy), image_size)
+    record = _record(content, file)
+    size = _size(record, image_size)
 
     def read(*, fisheye: bool) -> CameraFile:
-        lens = LensModel((fx, fy), (cx, cy), k if fisheye else k[:8], kind_of(fisheye))
-        return fitted_camera(lens, "OpenCV", size, "distortion_coefficients: ")
+        return fitted_camera(record.lens(fisheye=fisheye), "OpenCV", size, "distortion_coefficients: ")
 
-    if record.is_fisheye:
-        if len(k) != 4:
-            raise ArgumentError("distortion_coefficients: expected the 4 coefficients of a fisheye")
-        return read(fisheye=True)
-    if len(k) not in (0, 4, 5, 8, 12, 14) or any(k[8:]):
-        raise ArgumentError(
-            "distortion_coefficients: expected 4, 5 or 8; thin prisms and tilted sensors are not known here"
-        )
-    if record.is_fisheye is not None or len(k) != 4 or not any(k):
-        return read(fisheye=False)
+    if record.is_fisheye is not None or len(record.coefficients) != 4 or not any(record.coefficients):
+        return read(fisheye=bool(record.is_fisheye))
     brown = other = None
     with suppress(ArgumentError):
         other = read(fisheye=True)
@@ -129,6 +127,22 @@ def read_opencv(content: dict[str, Any], file: str, image_size: ImageSize | None
     return brown
 
 
+def _record(content: dict[str, Any], file: str) -> _OpenCV:
+    """Plain values by the names and as the matrices of OpenCV's calibration."""
+    named = {_ALIASES.get(name, name): value for name, value in content.items()}
+    for name, rows in (("camera_matrix", 3), ("distortion_coefficients", 1)):
+        given = named.get(name)
+        shape = given if isinstance(given, dict) else {}
+        if isinstance(data := shape.get("data", given), list):  # as ``ros2 topic echo`` prints them; or row by row
+            values = [value for row in data for value in (row if isinstance(row, list) else [row])]
+            named[name] = {"rows": rows, "cols": len(values) // rows, **shape, "data": values}
+        elif name in named and not shape:
+            raise ArgumentError(f"{name}: expected rows, cols and data, or a list of numbers")
+    if named.get("distortion_model") == "":
+        raise ArgumentError("distortion_model: is empty, as of a camera that is not calibrated")
+    return convert(named, _OpenCV, file, strict=False)
+
+
 def _is_rather(fisheye: CameraFile, brown: CameraFile) -> bool:
     """Check whether coefficients are a fisheye's: these make a symmetric lens of a wide view, Brown's do not."""
     camera, one, other = brown.camera, fisheye.fit, brown.fit
@@ -138,14 +152,14 @@ def _is_rather(fisheye: CameraFile, brown: CameraFile) -> bool:
     return wide and other.largest > max(_ASYMMETRIC * camera.scale, _TIMES_CLOSER * one.largest)
 
 
-def _size(record: _OpenCV, center: tuple[float, float], image_size: ImageSize | None) -> tuple[int, int]:
+def _size(record: _OpenCV, image_size: ImageSize | None) -> tuple[int, int]:
     """Width and height, of the images where the file does not say them."""
     given = record.image_width, record.image_height
     if given[0] is not None and given[1] is not None:
         return given[0], given[1]
     if image_size is None or given != (None, None):
         raise ArgumentError(f"image_{'width' if given[0] is None else 'height'}: is missing")
-    size = image_size()
+    size, center = image_size(), record.lens(fisheye=False).center
     if any(abs((c + 0.5) / side - 0.5) > _OFF_CENTER for c, side in zip(center, size, strict=True)):
         raise ArgumentError(
             f"has no image_width and image_height, and its principal point {center[0]:.0f}, {center[1]:.0f} is not "
@@ -161,7 +175,7 @@ def opencv_text(camera: Camera, *, yaml: bool = True, fisheye: bool = False) -> 
     """
     lens, fit, _ = nearest_model(camera, {FISHEYE: ""} if fisheye else {POLYNOMIAL: "", RATIONAL: ""})
     mark = {"fisheye_model": 1} if fisheye else {}
-    content = {**_calibration(camera, lens, **mark), OWN: own_record(camera, fit)}
+    content = {**_calibration(camera, lens, **mark), FIELD: embedded_camera(camera, fit)}
     return "%YAML:1.0\n---\n" + as_yaml(content) if yaml else json.dumps(content, indent=4) + "\n", fit
 
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
+from rdstitch.camera_files.embedded_camera import FIELD, Written, as_yaml, comments, embedded_camera
 from rdstitch.camera_files.lens_models import (
     FISHEYE,
     POLYNOMIAL,
@@ -18,7 +19,6 @@ from rdstitch.camera_files.lens_models import (
     kind_of,
     nearest_model,
 )
-from rdstitch.camera_files.own_record import OWN, Written, as_yaml, comments, own_record
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
@@ -98,7 +98,7 @@ _COEFFICIENTS = {False: ("k1", "k2", "p1", "p2", "k3"), True: ("k1", "k2", "k3",
 class _OpenDroneMap(Struct, kw_only=True):
     """Lens models of OpenSfM, with lengths in units of the longer side."""
 
-    projection_type: Literal["perspective", "brown", "simple_radial", "radial", "fisheye_opencv"]
+    projection_type: Literal["perspective", "brown", "simple_radial", "radial", "fisheye", "fisheye_opencv"]
     width: Side
     height: Side
     focal: float | None = None
@@ -126,7 +126,7 @@ def read_opendronemap(entry: Any, file: str, name: str) -> CameraFile:
     fx, fy = (record.focal or value or 0.0 for value in (record.focal_x, record.focal_y))
     focal = (fx * longer, fy * longer)
     center = ((size[0] - 1) / 2 + record.c_x * longer, (size[1] - 1) / 2 + record.c_y * longer)
-    fisheye = record.projection_type == "fisheye_opencv"
+    fisheye = record.projection_type.startswith("fisheye")  # they differ by how many coefficients they have
     k = tuple(getattr(record, name) for name in _COEFFICIENTS[fisheye])
     return fitted_camera(LensModel(focal, center, k, kind_of(fisheye)), "OpenDroneMap", size)
 
@@ -145,7 +145,7 @@ def opendronemap_json(camera: Camera) -> Written:
         "c_x": (lens.center[0] - (width - 1) / 2) / longer,
         "c_y": (lens.center[1] - (height - 1) / 2) / longer,
         **dict(zip(_COEFFICIENTS[lens.fisheye], lens.coefficients, strict=True)),
-        OWN: own_record(camera, fit),
+        FIELD: embedded_camera(camera, fit),
     }
     return json.dumps({f"v2 unknown unknown {width} {height} {kind} {fx:.4g}": entry}, indent=4) + "\n", fit
 

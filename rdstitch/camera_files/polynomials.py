@@ -19,8 +19,8 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from rdstitch.arrays import FloatArray
+from rdstitch.camera_files.embedded_camera import Written, comments
 from rdstitch.camera_files.lens_models import CLOSE, CameraFile, LensFit, LensSamples, fitted_camera
-from rdstitch.camera_files.own_record import Written, comments
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensKind, LensModel

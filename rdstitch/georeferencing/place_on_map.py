@@ -56,21 +56,20 @@ def place_on_map(
     points, else UTM (UPS near the poles) on WGS 84. With ``force`` positions that the images contradict place it too,
     and the reason says so.
     """
-    views = views_of([source.camera for source in sources], to_output, [source.down for source in sources])
     points = _control_points(sources, to_output)
-    control = {point.name: (point, pixel) for point, pixel in points if not point.check}
+    control = [(point, pixel) for point, pixel in points if not point.check]
+    count, what = len(control), f"{len(control)} {CONTROL} are in the images"
     if not control:
-        known = _of_positions(sources, views, errors)
-        if len(known.places) < MIN_POSITIONS:
-            count = f"{len(known.places)} of {len(sources)} images have a GPS position"
-            return None, f"{count}, and {MIN_POSITIONS} are needed"
-        return _placed(known, errors, epsg, force)
-    if len(control) < MIN_POSITIONS:
-        return None, f"{len(control)} {CONTROL} are in the images, and {MIN_POSITIONS} are needed"
-    system = next(iter(control.values()))[0].epsg
-    if epsg is None and system != WGS84:
-        epsg = system
-    place, reason = _placed(_of_control(list(control.values()), views, errors), errors, epsg, force)
+        count = sum(source.metadata.gps is not None for source in sources)
+        what = f"{count} of {len(sources)} images have a GPS position"
+    if count < MIN_POSITIONS:
+        return None, f"{what}, and {MIN_POSITIONS} are needed"
+    views = views_of([source.camera for source in sources], to_output, [source.down for source in sources])
+    if not control:
+        return _placed(_of_positions(sources, views, errors), errors, epsg, force)
+    if epsg is None and control[0][0].epsg != WGS84:
+        epsg = control[0][0].epsg
+    place, reason = _placed(_of_control(control, views, errors), errors, epsg, force)
     checks = [(point, pixel) for point, pixel in points if point.check]
     if place is None or not checks:
         return place, reason

@@ -121,7 +121,7 @@ def apply_to_images(saved: SavedRegistration, images: FoundImages, run: Run, opt
     given = read_replacements(saved, images.frames, options, run.guard, run.options.composite.max_memory)
     OutputPlan.of_images(run, ()).check_places(list(given.sources.values()))
     lens, of_lens = _lens_of_band(saved, given.sources, run.progress)
-    plan, run, of_turn = _laid_out(saved, given.sources, lens, run)
+    plan, of_turn = _laid_out(saved, given.sources, lens, run.options.composite)
     composed, of_output = compose_images(plan, run)
     sources = dict(zip(given.sources, plan.placed.sources, strict=True))
     result = Recomposition(
@@ -141,17 +141,15 @@ def apply_to_images(saved: SavedRegistration, images: FoundImages, run: Run, opt
 
 
 def _laid_out(
-    saved: SavedRegistration, sources: Mapping[int, Source], lens: BandLens | None, run: Run
-) -> tuple[CanvasPlan, Run, list[Message]]:
-    """Where the images lie, by the sidecar and the lens of their band, and how they are composed there."""
-    composite = run.options.composite
+    saved: SavedRegistration, sources: Mapping[int, Source], lens: BandLens | None, composite: CompositeOptions
+) -> tuple[CanvasPlan, list[Message]]:
+    """Where the images lie, by the sidecar and the lens of their band."""
     if lens is not None:
         sources = {index: replace(source, camera=lens.camera(source.camera)) for index, source in sources.items()}
     placed, of_turn = reoriented(_placed(saved, sources, lens), composite, saved.composite)
     if (grid := _same_grid(saved, sources, composite)) is not None:
-        placed, composite = replace(placed, grid=grid), replace(composite, crop="none")
-    run = replace(run, options=replace(run.options, composite=composite))
-    return CanvasPlan.of(placed, composite), run, of_turn
+        placed = replace(placed, grid=grid)
+    return CanvasPlan.of(placed, composite), of_turn
 
 
 def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions) -> SavedGrid | None:

@@ -114,8 +114,12 @@ def compose_images(
     def report(fraction: float) -> None:
         run.progress("compositing", round(100 * fraction), 100)
 
+    def place_of(final: Canvas) -> Georeference | None:
+        # Without rounding, where the pixels are those of an earlier output.
+        return place_on_canvas(place, canvas, final) if place is None or placed.grid is None else placed.grid.place
+
     def tags(final: Canvas) -> list[ExtraTag]:
-        on_final = place_on_canvas(place, canvas, final)
+        on_final = place_of(final)
         return [] if on_final is None else on_final.tiff_tags()
 
     made: Composite | FileComposite
@@ -128,7 +132,7 @@ def compose_images(
             output, plan.decisions, report, run_blocks, metadata=metadata, extra_tags=tags, outputs=outputs
         )
         composed = replace(composed, written=written)
-    place = place_on_canvas(place, canvas, made.canvas)
+    place = place_of(made.canvas)
     messages += made.messages
     if output is not None:
         messages += [

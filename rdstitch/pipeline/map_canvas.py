@@ -8,6 +8,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, CompositeOptions, plan_canvas, plan_panorama
+from rdstitch.compositing.boxes import encloses
 from rdstitch.compositing.canvas import refuse_scale
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.crs import Crs
@@ -15,7 +16,9 @@ from rdstitch.georeferencing.georeference import Georeference
 from rdstitch.georeferencing.map_grid import MapGrid, grid_of_extent, read_grid
 from rdstitch.georeferencing.place_on_map import MIN_POSITIONS, has_place, place_on_map
 from rdstitch.inputs.source import Source
-from rdstitch.results.placed_images import PlacedImages
+from rdstitch.results.placed_images import PlacedImages, SavedGrid
+
+_SAME_PIXELS = 1e-6  # pixels that two grids may be off: rounding
 
 
 def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:
@@ -39,7 +42,7 @@ def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
     """The canvas of the images, no larger than ``options.max_size``."""
     canvas = _plan(placed, options, options.scale)
     if placed.grid is not None:
-        return _on_grid(canvas, placed, placed.grid.from_plane, placed.grid.size)
+        return _on_saved_grid(canvas, placed, placed.grid, cropped=options.crop == "auto")
     if options.max_size is None or max(canvas.size) <= options.max_size:
         return canvas
     # The canvas has whole pixels around the images, and a full turn a multiple of some: these may be too many.
@@ -77,7 +80,8 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
                 raise ArgumentError(f"{name} needs a georeferenced output: {reason or 'that is off'}; leave it out")
         return canvas, None, reason
     if placed.grid is not None:
-        return canvas, placed.grid.place, reason
+        saved = placed.grid.place
+        return canvas, saved and saved.after(canvas.matrix @ np.linalg.inv(placed.grid.from_plane)), reason
     if (grid := _grid(options, place)) is not None:
         on_grid = grid.place.in_pixels(place) @ canvas.matrix
         laid = _on_grid(canvas, placed, on_grid, grid.size)
@@ -119,6 +123,17 @@ def _grid(options: CompositeOptions, place: Georeference) -> MapGrid | None:
     if options.extent is None:
         return None
     return grid_of_extent(place.crs, options.extent, (options.gsd or place.gsd) * place.map_scale)
+
+
+def _on_saved_grid(canvas: Canvas, placed: PlacedImages, grid: SavedGrid, *, cropped: bool) -> Canvas:
+    """The canvas of which a crop leaves the pixels of an earlier output; these alone, where it does not hold them."""
+    to_grid = grid.from_plane @ np.linalg.inv(canvas.matrix)
+    left, top = np.rint(-to_grid[:2, 2]).astype(int).tolist()
+    shift = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top], [0.0, 0.0, 1.0]])
+    box = left, top, left + grid.size[0], top + grid.size[1]
+    if cropped and np.abs(to_grid - shift).max() < _SAME_PIXELS and encloses((0, 0, *canvas.size), box):
+        return replace(canvas, cropped_to=box)
+    return replace(_on_grid(canvas, placed, grid.from_plane, grid.size), cropped_to=(0, 0, *grid.size))
 
 
 def _on_grid(canvas: Canvas, placed: PlacedImages, from_plane: FloatArray, size: tuple[int, int]) -> Canvas:

@@ -51,17 +51,16 @@ class LinkResiduals(NamedTuple):
 def match_graph(registration: Registration) -> str:
     """Outlines of all images, and a line for each pair: thick where there are many matches, red where errors are."""
     alignment = registration.alignment
-    used = np.flatnonzero(alignment.used)
-    outlines = {int(k): footprint(registration, int(k)) for k in used}
-    centers = {int(k): image_centre(registration, int(k)) for k in used}
-    points = np.concatenate(list(outlines.values()))
+    used = np.flatnonzero(alignment.used).tolist()
+    outlines, placed = zip(*(_outline_and_center(registration, k) for k in used), strict=True)
+    centers, points = dict(zip(used, placed, strict=True)), np.concatenate(outlines)
     low = np.nanmin(points, axis=0)
     extent = np.maximum(np.nanmax(points, axis=0) - low, 1e-9)
     scale = float((_GRAPH_SIDE - 2 * _GRAPH_MARGIN) / extent.max())
     (width, height), shift = (extent * scale + 2 * _GRAPH_MARGIN).tolist(), _GRAPH_MARGIN / scale - low
     parts = [
         polyline((outline + shift) * scale, closed=True, stroke=BLUE, fill=BLUE, fill_opacity=0.05, stroke_opacity=0.5)
-        for outline in outlines.values()
+        for outline in outlines
     ]
     links = alignment.holding
     by_error = sorted(links, key=lambda fit: fit.rms)
@@ -191,18 +190,6 @@ def residual_map(registration: Registration, residuals: Sequence[LinkResiduals])
     )
 
 
-def footprint(registration: Registration, index: int) -> FloatArray:
-    """Outline (K, 2) of an image on the plane; where the camera only turned, longitude and latitude, radians."""
-    camera = registration.alignment.cameras[index]
-    return _on_plane(registration, index, camera.outline(_POINTS_PER_SIDE))
-
-
-def image_centre(registration: Registration, index: int) -> FloatArray:
-    """Centre (2,) of an image, as :func:`footprint`."""
-    width, height = registration.alignment.cameras[index].image_size
-    return _on_plane(registration, index, np.array([[(width - 1) / 2, (height - 1) / 2]])).reshape(2)
-
-
 def link_residuals(registration: Registration) -> list[LinkResiduals]:
     """Of each link that is used; without the inliers that miss by more than four times its error."""
     alignment, pairs = registration.alignment, {pair.images: pair for pair in registration.pairs}
@@ -216,12 +203,15 @@ def link_residuals(registration: Registration) -> list[LinkResiduals]:
     return residuals
 
 
-def _on_plane(registration: Registration, index: int, points: FloatArray) -> FloatArray:
+def _outline_and_center(registration: Registration, index: int) -> tuple[FloatArray, FloatArray]:
+    """Of an image (K, 2) and (2,), on the plane; where the camera only turned, longitude and latitude, radians."""
     camera, matrix = registration.alignment.cameras[index], registration.alignment.homographies[index]
-    if not registration.alignment.on_sphere:
-        return to_plane(camera, matrix, points)
-    places = PROJECTIONS["sphere"].project(to_directions(camera, matrix, points))
-    # Longitudes of one image have no jump.
-    middle_longitude = np.arctan2(matrix[0, 2], matrix[2, 2])
-    places[:, 0] = middle_longitude + np.mod(places[:, 0] - middle_longitude + np.pi, 2.0 * np.pi) - np.pi
-    return places
+    points = np.concatenate([camera.outline(_POINTS_PER_SIDE), [camera.image_center]])
+    if registration.alignment.on_sphere:
+        places = PROJECTIONS["sphere"].project(to_directions(camera, matrix, points))
+        # Longitudes of one image have no jump.
+        middle = np.arctan2(matrix[0, 2], matrix[2, 2])
+        places[:, 0] = middle + np.mod(places[:, 0] - middle + np.pi, 2.0 * np.pi) - np.pi
+    else:
+        places = to_plane(camera, matrix, points)
+    return places[:-1], places[-1]

@@ -1,7 +1,7 @@
 """Registered images, ready to be composited: aligned locally, without what is static."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Self
@@ -76,7 +76,7 @@ class PlacedImages:
             ),
         )
 
-    @property
+    @cached_property
     def cameras(self) -> list[Camera]:
         """Those of the images."""
         return [source.camera for source in self.sources]
@@ -103,10 +103,11 @@ class PlacedImages:
     def images(self, canvas: Canvas) -> list[PlacedImage]:
         """As the compositor takes them, with only the near parts of those that a canvas does not show whole."""
         displacements = self.displacements or [None] * len(self.sources)
-        images = zip(self.sources, self.homographies, canvas.near, displacements, strict=True)
+        statics = [self.static if camera.image_size == self._common_size else None for camera in self.cameras]
+        images = zip(self.sources, self.homographies, canvas.near, displacements, statics, strict=True)
         return [
             PlacedImage(
-                self._reader(source, part),
+                partial(_read_drawn, source, part, static),
                 source.camera,
                 homography,
                 exposure=source.metadata.exposure,
@@ -117,26 +118,20 @@ class PlacedImages:
                 coloured=source.metadata.channels in (3, 4),
                 transparent=source.may_be_transparent or self.static is not None,
             )
-            for source, homography, part, displacement in images
+            for source, homography, part, displacement, static in images
         ]
 
-    def _reader(self, source: Source, part: VisibleRegion | None) -> Callable[..., DecodedImage]:
-        """Reads an image, whole or reduced, without what is static in it and what is not near."""
-        read: Callable[..., DecodedImage] = source.read if part is None else partial(_read_near, source.read, part)
-        if self.static is None or source.camera.image_size != self._common_size:
-            return read
-        return partial(_read_moving, read, self.static)
 
-
-def _read_moving(read: Callable[..., DecodedImage], static: NDArray[np.bool_], reduction: int = 1) -> DecodedImage:
-    """An image, whole or reduced, without what is static."""
-    image = read(reduction)
+def _read_drawn(
+    source: Source, part: VisibleRegion | None, static: NDArray[np.bool_] | None, reduction: int = 1
+) -> DecodedImage:
+    """An image, whole or reduced, with what is not near, and what is static, transparent."""
+    image = source.read(reduction)
+    if part is not None:
+        image = part.masked(image)
+    if static is None:
+        return image
     height, width = image.pixels.shape[:2]
     rows, columns = np.arange(height) * static.shape[0] // height, np.arange(width) * static.shape[1] // width
     alpha = np.full((height, width), 255, dtype=np.uint8) if image.alpha is None else image.alpha
     return replace(image, alpha=np.where(static[np.ix_(rows, columns)], np.uint8(0), alpha))
-
-
-def _read_near(read: Callable[..., DecodedImage], part: VisibleRegion, reduction: int = 1) -> DecodedImage:
-    """An image, whole or reduced, of which only its near part is drawn."""
-    return part.masked(read(reduction))

@@ -43,6 +43,18 @@ def test_same_images_give_the_same_bytes(rdstitch: Run, frames: list[Path], stit
     assert third.read_bytes() == stitched.read_bytes()
 
 
+def test_a_cropped_image_has_the_same_bytes_again(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    """Seams are decided on the whole canvas, as before; and of fewer images the same pixels are left."""
+    image, again, fewer = (tmp_path / f"{name}.tif" for name in ("a", "again", "fewer"))
+    rdstitch("mosaic", *frames, "-o", image, "--crop", *CACHED)
+    _apply(rdstitch, _sidecar(image), frames[0].parent, again)
+    assert again.read_bytes() == image.read_bytes()
+    assert sidecar_of(again)["options"] == sidecar_of(image)["options"]
+    _apply(rdstitch, _sidecar(again), frames[0], fewer, told="left out")
+    then, now = (sidecar_of(written)["output"] for written in (image, fewer))
+    assert (now["size"], now["plane_to_output"]) == (then["size"], then["plane_to_output"])
+
+
 def test_lambda_of_a_lens_with_two_coefficients_is_that_of_the_nearest_one(
     rdstitch: Run, frames: list[Path], tmp_path: Path
 ) -> None:

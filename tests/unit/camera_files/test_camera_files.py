@@ -306,6 +306,13 @@ def test_opendronemap_of_others(tmp_path: Path) -> None:
     assert found.camera.center == (1999.5, 1499.5)
     # Near the centre r_d = r_u (1 + k1 r²), and r_u = r_d / (1 + λ r_d²): λ is about k1 in focal lengths.
     assert found.camera.distortion_focal == pytest.approx(-0.02, abs=0.004)
+    entry |= {"projection_type": "fisheye", "focal": 0.4}
+    of_opencv = entry | {"projection_type": "fisheye_opencv", "k3": 0.0, "k4": 0.0}
+    cameras = []
+    for fisheye in (entry, of_opencv):
+        file.write_text(json.dumps({"one": fisheye}), encoding="utf-8")
+        cameras.append(load_camera(file))
+    assert cameras[0] == cameras[1]
     file.write_text(json.dumps({"one": entry, "two": entry}), encoding="utf-8")
     with pytest.raises(InputError, match="2 cameras"):
         load_camera(file)
@@ -417,7 +424,7 @@ def test_what_others_know_and_rdstitch_does_not_is_named(tmp_path: Path, text: s
         ("cameras.json", '"width": 4000', '"width": 1' + 400 * "0", "width"),
         ("c.pto", "i w4000", "i w4e30", "w: "),
         ("cameras.json", '"focal_x": ', '"focal_x": 1e308, "x": ', "focal length"),
-        ("cameras.json", '"fisheye_opencv",', '"fisheye",', "projection_type"),
+        ("cameras.json", '"fisheye_opencv",', '"fisheye62",', "projection_type"),
         ("cameras.json", '"focal_x"', '"focal_z"', "focal_x"),
         ("cameras.json", '"k1": ', '"k1": 1', "folds"),
         ("c.pto", " f3 v", " f4 v", "fisheye"),

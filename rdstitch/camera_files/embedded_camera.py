@@ -7,7 +7,7 @@ from rdstitch.camera_files.lens_models import LensFit
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.camera_record import camera_json
 
-OWN, OWN_COMMENT = "rdstitch", "#rdstitch "  # the field, and the comment
+FIELD, COMMENT = "rdstitch", "#rdstitch "  # the field, and the comment
 
 Written = tuple[str, LensFit]
 """A camera file, and how far its model is from the lens."""
@@ -15,18 +15,21 @@ Written = tuple[str, LensFit]
 
 def comments(camera: Camera, fit: LensFit, model: str) -> str:
     """Comment lines, the last one with the camera itself."""
-    record = json.dumps(own_record(camera, fit))
-    return f"# {model}: at most {fit.largest:.3f} pixels from the lens\n{OWN_COMMENT}{record}\n"
+    record = json.dumps(embedded_camera(camera, fit))
+    return f"# {model}: at most {fit.largest:.3f} pixels from the lens\n{COMMENT}{record}\n"
 
 
-def own_record(camera: Camera, fit: LensFit) -> dict[str, Any]:
+def embedded_camera(camera: Camera, fit: LensFit) -> dict[str, Any]:
     """The camera, and the residual of the model that was fitted to it; what is not known is left out."""
     known = {key: value for key, value in camera_json(camera).items() if value is not None}
     return {**known, "fit_rms_px": fit.rms, "fit_largest_px": fit.largest}
 
 
 def as_yaml(content: dict[str, Any], *, opencv: bool = True) -> str:
-    """Write numbers, texts, lists and one level of objects; with OpenCV's marks, which other readers do not know."""
+    """Write numbers, texts, lists and one level of objects; with OpenCV's marks, which other readers do not know.
+
+    What PyYAML makes of lists of lists OpenCV cannot read.
+    """
     lines = []
     for key, value in content.items():
         if not isinstance(value, dict):
