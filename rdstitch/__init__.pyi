@@ -2,7 +2,6 @@ from rdstitch import errors as errors
 from rdstitch import solvers as solvers
 from rdstitch import synthetic as synthetic
 from rdstitch.alignment import Alignment as Alignment
-from rdstitch.alignment.trajectory import Trajectory as Trajectory
 from rdstitch.camera_files import load_camera as load_camera
 from rdstitch.camera_files import save_camera as save_camera
 from rdstitch.errors import RdstitchError as RdstitchError
@@ -37,6 +36,7 @@ from rdstitch.results.stitch_result import OutputImage as OutputImage
 from rdstitch.results.stitch_result import StitchResult as StitchResult
 from rdstitch.robust import estimate_radial_homography as estimate_radial_homography
 from rdstitch.sidecar.recomposition import Recomposition as Recomposition
+from rdstitch.trajectories.trajectory import Trajectory as Trajectory
 
 __version__: str
 __all__: list[str]

@@ -14,10 +14,10 @@ import numpy as np
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.features import Correspondences
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.two_view import Pair, PairRegistration
+from rdstitch.numerics.nearest_points import nearest_points
 from rdstitch.synthetic import RenderedSequence
 from rdstitch.synthetic.lenses import focal_length
 from rdstitch.synthetic.poses import pixels_of_texels, plane_outline

@@ -19,13 +19,13 @@ import rdstitch
 from examples.benchmarks.driver import run
 from examples.judging.trajectories import compare_trajectories
 from examples.worlds.floor_drives import DISTORTION, floor_drive, true_path
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.inputs.frame_stream import open_frame_stream
 from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.follow import follow
 from rdstitch.results.pose import Pose
 from rdstitch.system.process_memory import peak_memory
+from rdstitch.trajectories.trajectory import Trajectory
 
 
 def path_of(frames: list[Pose]) -> Trajectory:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
+from rdstitch.trajectories.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import RIGID, YAW, X, Y
 from rdstitch.alignment.result import PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import LENS_PARAMETERS
 from rdstitch.geometry.planar_motion import PlanarMotion, rotation_from_tilt
@@ -33,6 +32,7 @@ from rdstitch.matching.links import Link
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
 from rdstitch.robust.priors import Prior
+from rdstitch.trajectories.trajectory import Trajectory
 
 RECIPE = "rdstitch as it is"
 

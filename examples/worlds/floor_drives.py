@@ -8,9 +8,9 @@ import numpy as np
 
 from examples.worlds.paths import drive_poses
 from rdstitch.alignment.result import PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic import Photometry, RenderedSequence, ground, sequence_over
+from rdstitch.trajectories.trajectory import Trajectory
 
 DISTORTION = -0.25
 

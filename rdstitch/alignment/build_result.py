@@ -32,8 +32,8 @@ from rdstitch.geometry.division_model import nearest_one_parameter
 from rdstitch.geometry.planar_motion import rigid_in_plane
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.matching.match_graph import connected_components
+from rdstitch.numerics.robust_loss import ALIGNMENT_WIDTH
 from rdstitch.results.messages import Message
-from rdstitch.robust.loss import ALIGNMENT_WIDTH
 from rdstitch.robust.posterior import MODEL_ERROR
 
 _STEP = 1e-5  # of differences of λ, μ and ν

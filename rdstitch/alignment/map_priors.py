@@ -22,8 +22,8 @@ from rdstitch.alignment.motion_models import X, Y
 from rdstitch.alignment.sentences import map_contradicted
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.geometry.places import MILLIMETRE
+from rdstitch.numerics.robust_loss import RAYLEIGH_MEDIAN
 from rdstitch.results.messages import Message
-from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 from rdstitch.robust.posterior import MODEL_ERROR
 from rdstitch.robust.similarity_fit import OUTLYING, SimilarityFit, fit_similarity
 

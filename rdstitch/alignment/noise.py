@@ -14,7 +14,7 @@ from rdstitch.alignment.cycle_consistency import misfitting_links
 from rdstitch.alignment.least_squares.link_equations import squared_lengths, whitened_errors
 from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.geometry.nearest_points import SAME_FEATURE, separate_neighbours
+from rdstitch.numerics.nearest_points import SAME_FEATURE, separate_neighbours
 from rdstitch.robust.posterior import Evidence, overlap_cells
 
 _CELLS = (2, 3, 4)  # cells per side of a link's overlap within which errors are added up; the worst counts

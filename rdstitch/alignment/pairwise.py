@@ -19,7 +19,7 @@ from rdstitch.alignment.motion_models import HOMOGRAPHY, MotionModel
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.geometry.division_model import undistort
 from rdstitch.geometry.radial_homography import RadialHomography, transfer
-from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost, sigma_of
+from rdstitch.numerics.robust_loss import ALIGNMENT_WIDTH, robust_cost, sigma_of
 from rdstitch.solvers.homography import direct_linear
 
 _MAX_ITERATIONS = 24  # a start need not be the minimum

@@ -22,7 +22,7 @@ from rdstitch.alignment.select import ModelChoice, best_of
 from rdstitch.alignment.starts import fit_model, start_from
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import ModelName, Purpose
-from rdstitch.robust.loss import NORMAL_MEDIAN
+from rdstitch.numerics.robust_loss import NORMAL_MEDIAN
 
 _MIN_IMAGES = 3  # images: of two, tilts do what heights do, and the errors do not show which
 

@@ -13,7 +13,7 @@ from rdstitch.alignment.pairwise import best_trial, nearest_pairs
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.radial_homography import inverses
 from rdstitch.matching.match_graph import SpanningTree, spanning_tree
-from rdstitch.robust.loss import robust_cost
+from rdstitch.numerics.robust_loss import robust_cost
 
 _LONG_CHAIN = 60  # images over which chained homographies drift so far that a planar model is the better start
 

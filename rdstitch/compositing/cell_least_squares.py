@@ -6,7 +6,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.compositing.overlap_cells import Cells
-from rdstitch.geometry.conjugate_gradients import conjugate_gradients
+from rdstitch.numerics.conjugate_gradients import conjugate_gradients
 from rdstitch.system.late_imports import sparse, sparse_linalg
 
 VISIBLE = 0.004  # log units, a grey level of a light sample: differences below are as good as none

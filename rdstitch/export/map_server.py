@@ -11,7 +11,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing.plan import default_memory
 from rdstitch.errors import ArgumentError, LimitError
@@ -21,6 +20,7 @@ from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import read_image
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs, text_bytes
+from rdstitch.trajectories.trajectory import Trajectory
 
 _OUTPUT_BYTES, _MAP_BYTES = 2, 4  # of a pixel: grey levels and transparency, and on the map also while it is written
 

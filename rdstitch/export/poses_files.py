@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch.alignment.result import PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import PosesFrame
 from rdstitch.errors import ArgumentError
@@ -25,6 +24,7 @@ from rdstitch.georeferencing.georeference import Georeference
 from rdstitch.inputs.times import timestamps_of
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.late_imports import spatial
+from rdstitch.trajectories.trajectory import Trajectory
 
 
 def poses_table(result: StitchResult, frame: PosesFrame = "enu", height: float = 1.0) -> str:

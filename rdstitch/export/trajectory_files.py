@@ -12,10 +12,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.choices import TrajectoryFrame
 from rdstitch.geometry.path_frames import AXES, covariance_in_frame, in_frame, turn_about_z
+from rdstitch.trajectories.trajectory import Trajectory
 
 _SIDE = 800.0  # pixels of the drawing's longer side
 _MARGIN = 60.0  # pixels

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.choices import TrajectoryFormat, TrajectoryFrame
 from rdstitch.errors import OutputError
 from rdstitch.export.trajectory_files import WRITERS, frame_of, heading, positions_in_frame, times_or_numbers
 from rdstitch.geometry.path_frames import NOT_MEASURED, ros_covariance
 from rdstitch.system.outputs import Outputs, text_bytes
+from rdstitch.trajectories.trajectory import Trajectory
 
 
 def check_bag(file: Path, *, overwrite: bool) -> None:

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.conjugate_gradients import conjugate_gradients
 from rdstitch.local_alignment.field import DisplacementField, bilinear, grid_shape, node_points
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches
+from rdstitch.numerics.conjugate_gradients import conjugate_gradients
+from rdstitch.numerics.robust_loss import robust_weight
 from rdstitch.system.late_imports import sparse, sparse_linalg
 
 _ROBUST = 2.0  # medians of the residuals, or their noise where relief makes them larger: width of the loss at the end
@@ -99,8 +100,7 @@ class Reweighting:
         self._sharp += self._scale <= sharpest
         scale = max(self._scale, sharpest)
         self._scale = scale * _SHARPENED
-        weight: FloatArray = (1.0 / (1.0 + (length / scale) ** 2)) ** 2 / sharpest**2
-        return weight
+        return robust_weight(length**2, scale) / sharpest**2
 
 
 def fit_fields(

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, Rows
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.nearest_points import separate_neighbours
 from rdstitch.geometry.radial_homography import from_directions, from_plane, to_directions, to_plane
 from rdstitch.local_alignment.field import DisplacementField
+from rdstitch.numerics.nearest_points import separate_neighbours
 from rdstitch.system.late_imports import csgraph, sparse
 
 # Share of the image's diagonal: matches farther off are taken to be wrong. Where the ground rises by a tenth of the

@@ -15,12 +15,12 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import project
 from rdstitch.matching.feature_store import FeatureStore, StoredMatches
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.retrieval import Similarity, similarity
 from rdstitch.matching.two_view import Pair, PairRegistration
+from rdstitch.numerics.nearest_points import nearest_points
 from rdstitch.system.late_imports import sparse
 
 EXHAUSTIVE_UP_TO = 30

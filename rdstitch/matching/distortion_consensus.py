@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.robust.loss import NORMAL_MEDIAN
+from rdstitch.numerics.robust_loss import NORMAL_MEDIAN
 
 _ROUNDS = 20  # of reweighting; three or four are needed
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray
 from rdstitch.geometry.division_model import undistort
-from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.numerics.nearest_points import nearest_points
 from rdstitch.solvers.homography import direct_linear
 
 _NEIGHBOURS = 6

@@ -8,8 +8,6 @@ import numpy as np
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
-from rdstitch.alignment.odometry import along_odometry
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Named
 from rdstitch.inputs.odometry import Odometry
@@ -19,6 +17,8 @@ from rdstitch.inputs.times import timestamps_of
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message, shortened
 from rdstitch.results.registration import Registration
+from rdstitch.trajectories.odometry_fit import along_odometry
+from rdstitch.trajectories.trajectory import Trajectory
 from rdstitch.verification.limits import Limits
 
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
 from rdstitch.errors import RegistrationError
 from rdstitch.export.trajectory_files import has_times, path_as_svg
@@ -43,6 +42,7 @@ from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import json_bytes, text_bytes
 from rdstitch.system.progress import Progress, silent
+from rdstitch.trajectories.trajectory import Trajectory
 from rdstitch.verification.verdict import RefusedError
 
 _NO_TIMES = Message(

@@ -12,13 +12,13 @@ from rdstitch.errors import RegistrationError
 from rdstitch.features import Correspondences
 from rdstitch.features.crossings import find_crossings
 from rdstitch.features.prepared_image import Stretch, prepare
-from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.radial_homography import RadialHomography, from_plane, to_plane
 from rdstitch.inputs.source import Source
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.repeated_pattern import rematch_elsewhere, shows_repeated_pattern
 from rdstitch.matching.two_view import PairRegistration
+from rdstitch.numerics.nearest_points import nearest_points
 from rdstitch.options.feature_options import CLOSER, WORK_MEGAPIXELS
 from rdstitch.pipeline.aligner import AlignedPairs, Aligner
 from rdstitch.robust.chance import occupied_cells

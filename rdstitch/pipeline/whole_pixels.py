@@ -8,8 +8,8 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.match_graph import spanning_forest, spanning_tree
+from rdstitch.numerics.robust_loss import RAYLEIGH_MEDIAN
 from rdstitch.results.registration import Registration
-from rdstitch.robust.loss import RAYLEIGH_MEDIAN
 from rdstitch.robust.posterior import Evidence
 
 _RESOLVED = 0.1  # standard deviation of the shift of a pair, pixels, up to which its matches can say that it is whole

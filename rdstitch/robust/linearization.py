@@ -1,6 +1,6 @@
 """The robust loss of matches under a homography and a lens, with its normal equations, for many pairs at once.
 
-The loss is that of :mod:`rdstitch.robust.loss`, of the whitened transfer error in measured pixels.
+The loss is that of :mod:`rdstitch.numerics.robust_loss`, of the whitened transfer error in measured pixels.
 
 With ``z = H p(λ)`` the derivative of the transferred point by H is ``(∂u/∂z) ⊗ p``. So a match enters ``J'J`` by a
 matrix of 3 x 3 times ``p p'``, and nothing of the size of a Jacobian is ever formed.
@@ -13,8 +13,8 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 from rdstitch.geometry.division_model import distorted_ratio
+from rdstitch.numerics.robust_loss import loss_ratio, robust_weight
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
-from rdstitch.robust.loss import loss_ratio, robust_weight
 from rdstitch.robust.measurements import Measurements
 
 _PAIRS = np.triu_indices(3)  # entries of a symmetric matrix of 3 x 3 that determine it

@@ -8,7 +8,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray, Rows
 from rdstitch.geometry.division_model import OBSERVABLE_STD
-from rdstitch.robust.loss import loss_width
+from rdstitch.numerics.robust_loss import loss_width
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.robust.posterior import Evidence, farthest_error

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.arrays import FloatArray
-from rdstitch.geometry.nearest_points import SAME_FEATURE, separate_neighbours
 from rdstitch.geometry.radial_homography import RadialHomography
+from rdstitch.numerics.nearest_points import SAME_FEATURE, separate_neighbours
 from rdstitch.robust.levenberg_marquardt import descend
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel

@@ -31,7 +31,7 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import FocalSource
 from rdstitch.geometry.camera import Camera
-from rdstitch.robust.loss import normal_std
+from rdstitch.numerics.robust_loss import normal_std
 
 TWENTY_TO_ONE = 6.0
 """What odds cost that are said beforehand: a richer lens is rarer, ``pano`` is for turns and ``mosaic`` for planes."""

@@ -7,10 +7,10 @@ import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.division_model import MAX_ABS_DISTORTION
+from rdstitch.numerics.robust_loss import loss_width, noise_of, robust_cost
 from rdstitch.robust.covariance import covariances
 from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, descend
 from rdstitch.robust.linearization import PairLenses, TransferDerivatives, differentiate, entry_equations, influence
-from rdstitch.robust.loss import loss_width, noise_of, robust_cost
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import PairModel
 from rdstitch.robust.priors import Prior, prior_costs, prior_slopes

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray, evenly_spaced
-from rdstitch.robust.loss import robust_weight
+from rdstitch.numerics.robust_loss import robust_weight
 
 OUTLYING = 3.0
 """Standard deviations from which on a point is an outlier."""

@@ -13,12 +13,12 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import MatchBy
 from rdstitch.errors import InputError
-from rdstitch.geometry.nearest_points import nearest_points
 from rdstitch.geometry.places import GpsPosition
 from rdstitch.inputs.frame import Frame, files_of
 from rdstitch.inputs.positions import metres_around_median
 from rdstitch.io.metadata import read_metadata
 from rdstitch.io.opening import check_readable
+from rdstitch.numerics.nearest_points import nearest_points
 from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.sidecar.image_record import ImageRecord
 from rdstitch.sidecar.read import SavedRegistration

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.robust.loss import RAYLEIGH_MEDIAN
+from rdstitch.numerics.robust_loss import RAYLEIGH_MEDIAN
 from rdstitch.stage.equations import LinkedPoints, StageEquations, StageState, Variances
 from rdstitch.stage.grid import TileGrid
 

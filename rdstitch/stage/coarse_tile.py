@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.io.reduction import block_mean
-from rdstitch.robust.loss import normal_std
+from rdstitch.numerics.robust_loss import normal_std
 
 Image = NDArray[np.float32]
 

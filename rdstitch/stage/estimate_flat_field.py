@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.io.flat_field import FlatField
 from rdstitch.io.reduction import block_mean
-from rdstitch.robust.loss import NORMAL_MEDIAN, normal_std
+from rdstitch.numerics.robust_loss import NORMAL_MEDIAN, normal_std
 from rdstitch.stage.dark_level import DarkLevel, dark_level
 
 _MIN_TILES = 20  # fewer show one flat field as well as another

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.robust.loss import normal_std
+from rdstitch.numerics.robust_loss import normal_std
 from rdstitch.stage.coarse_tile import CORRELATED, CoarseTile, energies
 from rdstitch.stage.overlap import Overlap
 from rdstitch.stage.phase_correlation import correlate_frames, lay_tapered, peak_threshold, peaks

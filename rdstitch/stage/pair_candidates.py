@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.parabola import parabola_peak
-from rdstitch.robust.loss import normal_std
+from rdstitch.numerics.parabola import parabola_peak
+from rdstitch.numerics.robust_loss import normal_std
 from rdstitch.stage.coarse_tile import CoarseTile, coarse_tile
 from rdstitch.stage.evidence import HUNDRED_TO_ONE, WRONG_PEAK, log_evidence, wide_peaks
 from rdstitch.stage.grid import TileGrid

@@ -12,7 +12,6 @@ from rdstitch.alignment import Alignment, AlignmentOptions
 from rdstitch.alignment.delays import at_delay, change_with_delay
 from rdstitch.alignment.given_checks import judged_focal
 from rdstitch.alignment.motion_models import LOG_HEIGHT, MODELS, MotionModel
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import ModelName
 from rdstitch.geometry.camera import Camera
@@ -23,6 +22,7 @@ from rdstitch.robust import EstimationOptions
 from rdstitch.tracking.metric_plane import MetricPlane
 from rdstitch.tracking.placement import YAW, CameraPose, Placement
 from rdstitch.tracking.tracked_frame import IncomingFrame, TrackedFrame
+from rdstitch.trajectories.trajectory import Trajectory
 
 _KNOWN_STD = 0.002  # of λ: a tenth of a pixel in the corner of an image of 640 x 480 pixels, over half of it
 _MIN_KEYFRAMES_FOR_LENS = 12  # keyframes that λ is not known before

@@ -4,11 +4,11 @@ import cmath
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from rdstitch.alignment.odometry import OdometryFit, motions_of
 from rdstitch.inputs.odometry import motion_between
 from rdstitch.tracking.camera_knowledge import CameraKnowledge
 from rdstitch.tracking.placement import PlaneSimilarity
 from rdstitch.tracking.tracked_frame import IncomingFrame, TrackedFrame
+from rdstitch.trajectories.odometry_fit import OdometryFit, motions_of
 
 _KEYFRAMES = 60  # the last ones, by which it is found how the camera is mounted on the body
 

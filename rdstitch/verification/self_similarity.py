@@ -12,8 +12,8 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.parabola import parabola_peak
 from rdstitch.geometry.radial_homography import to_plane
+from rdstitch.numerics.parabola import parabola_peak
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.photometric_agreement import ComparedImage, Grey
 

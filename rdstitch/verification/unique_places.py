@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.geometry.parabola import parabola_peak
 from rdstitch.geometry.radial_homography import from_plane, to_plane
+from rdstitch.numerics.parabola import parabola_peak
 from rdstitch.verification.limits import Limits
 from rdstitch.verification.photometric_agreement import COMPARED_SIDE, ComparedImage, Grey
 from rdstitch.verification.self_similarity import Drawing, Overlaps, draw, drawing_scale

@@ -8,12 +8,12 @@ import numpy as np
 from examples.worlds.paths import drive_poses
 from rdstitch.alignment import Link
 from rdstitch.alignment.result import PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.robust import SolverName, estimate_radial_homography
 from rdstitch.synthetic import Poses
 from rdstitch.synthetic.poses import pixels_of_texels, texels_of_pixels
+from rdstitch.trajectories.trajectory import Trajectory
 
 PATHS = {"line": "line", "turn": "turn", "parallel parking": "parking"}
 

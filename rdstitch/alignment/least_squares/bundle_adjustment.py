@@ -24,8 +24,8 @@ from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import ModelMatrices, MotionModel
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.radial_homography import inverses
+from rdstitch.numerics.robust_loss import ALIGNMENT_WIDTH, robust_cost
 from rdstitch.robust.levenberg_marquardt import MAX_DAMPING, damping_by_gain
-from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_cost
 from rdstitch.robust.priors import prior_costs, prior_slopes
 
 MIN_GAIN = 1e-5

@@ -15,7 +15,7 @@ from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster, B
 from rdstitch.alignment.least_squares.link_equations import LinearizedErrors, linearized_errors
 from rdstitch.alignment.least_squares.normal_equations import SparseNormalEquations, link_derivatives
 from rdstitch.arrays import FloatArray
-from rdstitch.robust.loss import ALIGNMENT_WIDTH, robust_slope, robust_weight
+from rdstitch.numerics.robust_loss import ALIGNMENT_WIDTH, robust_slope, robust_weight
 
 Fields = Callable[[LinearizedErrors], FloatArray]
 """Changes (m, 2, C) of the errors of some links, pixels."""

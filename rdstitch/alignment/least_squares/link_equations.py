@@ -26,7 +26,7 @@ from rdstitch.geometry.radial_homography import (
     transfer_points,
     whiten,
 )
-from rdstitch.robust.loss import robust_weight
+from rdstitch.numerics.robust_loss import robust_weight
 
 
 @dataclass(frozen=True, eq=False)

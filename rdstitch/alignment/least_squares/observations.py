@@ -11,7 +11,7 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.links import Link, grid_subsample
-from rdstitch.robust.loss import ALIGNMENT_WIDTH, sigma_of
+from rdstitch.numerics.robust_loss import ALIGNMENT_WIDTH, sigma_of
 
 _CHUNK = 4096  # correspondences linearized at a time: what stays in cache
 _STATIC = 1.0  # pixels that the displacements of most correspondences of a link stay below where the camera stood still

@@ -17,7 +17,6 @@ from rdstitch.alignment.least_squares.plane_marks import Sighting
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import Alignment, PlanarPoses, Unused
 from rdstitch.alignment.sentences import explain_unaligned
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import LensName, ModelName, Purpose
 from rdstitch.errors import ArgumentError, RdstitchError, RegistrationError
@@ -26,6 +25,7 @@ from rdstitch.geometry.planar_motion import PlanarMotion
 from rdstitch.geometry.radial_homography import RadialHomography, transfer
 from rdstitch.matching.links import Link
 from rdstitch.matching.match_graph import SpanningTree, spanning_tree
+from rdstitch.trajectories.trajectory import Trajectory
 from tests.sampled import sampled
 
 

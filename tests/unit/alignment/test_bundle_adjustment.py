@@ -11,7 +11,7 @@ from rdstitch.alignment.least_squares.observations import Observations
 from rdstitch.alignment.least_squares.priors import Priors
 from rdstitch.alignment.motion_models import HOMOGRAPHY, MODELS, RIGID, TILTING, MotionModel
 from rdstitch.geometry.radial_homography import transfer_jacobian
-from rdstitch.robust.loss import robust_cost, robust_weight, sigma_of
+from rdstitch.numerics.robust_loss import robust_cost, robust_weight, sigma_of
 
 FREE_LENS = np.array([True, True, True, True, True])
 ONE_LENS = np.array([True, False, False, False, False])

@@ -13,10 +13,10 @@ from examples.worlds.alignment_scenes import grid, scene
 from rdstitch.alignment import AlignmentOptions, align
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X, Y
 from rdstitch.alignment.result import PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import TrajectoryFrame
 from rdstitch.export.trajectory_files import as_csv
+from rdstitch.trajectories.trajectory import Trajectory
 
 FOCAL = 520.0
 

@@ -24,7 +24,7 @@ from rdstitch.compositing.survey import Survey, survey_images
 from rdstitch.compositing.warp import locate, plan_warp
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.conjugate_gradients import conjugate_gradients
+from rdstitch.numerics.conjugate_gradients import conjugate_gradients
 from rdstitch.synthetic import ground
 from rdstitch.synthetic.rendering import Photometry
 from tests.sampled import sampled

@@ -8,7 +8,6 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import ArgumentError, LimitError, OutputError
 from rdstitch.export.map_server import write_map
 from rdstitch.export.poses_files import poses_file
@@ -23,6 +22,7 @@ from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs
 from rdstitch.tracking import TrackingResult
 from rdstitch.tracking.placement import Placement
+from rdstitch.trajectories.trajectory import Trajectory
 from tests.registrations import registration, source, stitched
 
 PATH = Trajectory(np.arange(2), np.zeros((2, 2)), np.zeros(2), np.ones(2))

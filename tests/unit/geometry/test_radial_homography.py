@@ -10,9 +10,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry import division_model
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.conjugate_gradients import conjugate_gradients
 from rdstitch.geometry.division_model import distort, horizon_radius, nearest_one_parameter, undistort, valid_radius
-from rdstitch.geometry.nearest_points import nearest_points, separate_neighbours
 from rdstitch.geometry.planar_motion import PlanarMotion
 from rdstitch.geometry.radial_homography import (
     RadialHomography,
@@ -22,6 +20,8 @@ from rdstitch.geometry.radial_homography import (
     transfer,
     transfer_jacobian,
 )
+from rdstitch.numerics.conjugate_gradients import conjugate_gradients
+from rdstitch.numerics.nearest_points import nearest_points, separate_neighbours
 from rdstitch.synthetic import FisheyeLens
 
 H = PlanarMotion((0.1, -0.2), 0.1, (0.2, -0.1), 1.1).homography() + 0.02 * np.arange(9).reshape(3, 3)

@@ -8,8 +8,7 @@ import pytest
 
 from rdstitch.alignment.noise import evidence_of
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, _damped_step, damping_by_gain, descend
-from rdstitch.robust.loss import (
+from rdstitch.numerics.robust_loss import (
     PAIR_WIDTH,
     loss_ratio,
     loss_width,
@@ -18,6 +17,7 @@ from rdstitch.robust.loss import (
     robust_weight,
     sigma_of,
 )
+from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, _damped_step, damping_by_gain, descend
 from rdstitch.robust.model_selection import rms_of
 from rdstitch.robust.posterior import Evidence
 from rdstitch.robust.priors import LENS_PRIORS, TILT_PRIOR, Prior, exact, focal_prior

@@ -9,8 +9,8 @@ from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import PlanarMotion
 from rdstitch.geometry.radial_homography import transfer
+from rdstitch.numerics.robust_loss import robust_cost
 from rdstitch.robust.covariance import covariances
-from rdstitch.robust.loss import robust_cost
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.robust.priors import Prior, focal_prior

@@ -15,7 +15,6 @@ from examples.judging.trajectories import compare_trajectories
 from examples.worlds.floor_drives import floor_drive, true_path
 from examples.worlds.paths import drive_poses
 from rdstitch.alignment import AlignmentOptions
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.features import FeatureOptions, Features, detect, match
 from rdstitch.features.corner_flow import CornerFlow, corners_of, matched_corners
 from rdstitch.features.prepared_image import PreparedImage, View, prepare
@@ -41,6 +40,7 @@ from rdstitch.tracking.map_refinement import MapRefinement
 from rdstitch.tracking.metric_plane import MetricPlane
 from rdstitch.tracking.odometry_prediction import OdometryPrediction
 from rdstitch.tracking.tracked_frame import IncomingFrame, TrackedFrame
+from rdstitch.trajectories.trajectory import Trajectory
 
 SIZE = (320, 240)
 DISTORTION = -0.25

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from examples.judging.trajectories import compare_trajectories
 from rdstitch.alignment.result import PlanarPoses
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import ArgumentError
 from rdstitch.export.trajectory_files import as_csv, as_kitti, as_tum
 from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic.poses import Poses, texels_of_pixels
+from rdstitch.trajectories.trajectory import Trajectory
 
 
 def _poses() -> PlanarPoses:

@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.arrays import FloatArray
 from rdstitch.inputs.odometry import BodyMotion, BodyPose, motion_between
-from rdstitch.robust.loss import RAYLEIGH_MEDIAN
+from rdstitch.numerics.robust_loss import RAYLEIGH_MEDIAN
+from rdstitch.trajectories.trajectory import Trajectory
 
 _EXACT = 1e-6  # of the longest step: no odometry is more exact, whatever it states
 _WHEELS = 0.01  # relative standard deviation of what all distances share: the size of the wheels

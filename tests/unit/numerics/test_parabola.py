@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rdstitch.geometry.parabola import parabola_peak
+from rdstitch.numerics.parabola import parabola_peak
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-9, 1e9])

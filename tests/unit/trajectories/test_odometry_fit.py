@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 import rdstitch
 from examples.worlds.floor_drives import DISTORTION, floor_drive, true_path
-from rdstitch.alignment.odometry import OdometryFit, along_odometry, bridged, motions_of
-from rdstitch.alignment.trajectory import Trajectory
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.odometry import BodyPose, read_odometry
 from rdstitch.synthetic import RenderedSequence
 from rdstitch.tracking import TrackingResult
+from rdstitch.trajectories.odometry_fit import OdometryFit, along_odometry, bridged, motions_of
+from rdstitch.trajectories.trajectory import Trajectory
 
 HEIGHT, LEVER, MOUNT = 0.42, 0.15 - 0.06j, np.exp(0.5j * np.pi)  # metres; the top of the image is ahead
 
