@@ -91,7 +91,7 @@ def _cut_away(placed: PlacedImages, options: CompositeOptions, matrix: FloatArra
     return 1.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Reference:
     """The reference image, in whose frame everything is turned."""
 
