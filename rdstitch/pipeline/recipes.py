@@ -118,7 +118,12 @@ def mosaic(
         are in the order of ``options.channel_order``; see :func:`rdstitch.inputs.frame.as_inputs`. Images that cannot
         be read are left out by name.
     output, options, every, progress, beside
-        As for :func:`pano`, and so is what is returned and raised.
+        As for :func:`pano`.
+
+    Returns
+    -------
+    StitchResult
+        As of :func:`pano`, and so is what is raised.
 
     Examples
     --------
