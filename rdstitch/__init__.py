@@ -11,7 +11,6 @@ from typing import Any
 _NAMES = {
     "": "errors solvers synthetic",
     "alignment": "Alignment",
-    "alignment.trajectory": "Trajectory",
     "camera_files": "load_camera save_camera",
     "errors": "RdstitchError",
     "export.layers": "write_layers",
@@ -38,6 +37,7 @@ _NAMES = {
     "results.stitch_result": "OutputImage StitchResult",
     "robust": "estimate_radial_homography",
     "sidecar.recomposition": "Recomposition",
+    "trajectories.trajectory": "Trajectory",
 }
 _HOMES = {name: f"{__name__}.{home}".rstrip(".") for home, names in _NAMES.items() for name in names.split()}
 

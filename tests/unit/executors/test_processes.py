@@ -28,8 +28,12 @@ def _alive(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    state = Path(f"/proc/{process}/stat")
-    return not state.exists() or state.read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    if not Path("/proc").exists():
+        return True
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:  # it has ended meanwhile
+        return False
 
 
 def _wait_until_gone(processes: list[int], seconds: float = 10.0) -> None:
