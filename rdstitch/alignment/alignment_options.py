@@ -85,7 +85,7 @@ class AlignmentOptions:
             raise ArgumentError("a standard deviation of a position must be positive, or NaN where it is not known")
         return CameraPriors(
             *known_focal(cameras),
-            tilt=self.tilt or (0.0, 0.0),
+            tilt=(0.0, 0.0) if self.tilt is None else (float(self.tilt[0]), float(self.tilt[1])),
             tilt_known=self.tilt is not None,
             attitudes=attitudes,
             attitudes_std=None if self.attitudes is None else self.attitudes_std,

@@ -188,6 +188,8 @@ class Camera:
         for name, values in (("value", (*self.coefficients, *self.center)), ("tilt", self.tilt or ())):
             if not all(map(math.isfinite, values)):
                 raise ImpossibleCameraError(f"camera has a {name} that is not finite: {values}")
+        if self.lens_covariance is not None and not all(math.isfinite(v) for row in self.lens_covariance for v in row):
+            raise ImpossibleCameraError("camera has a covariance of the lens that is not finite")
         stds = (self.distortion_std, self.focal_std, *(self.tilt_std or ()))
         # Infinite is that of what is not observable.
         if not all(std >= 0.0 for std in stds if std is not None):

@@ -109,7 +109,7 @@ def lens_fields(camera: Camera) -> dict[str, Any]:
         "coefficients": camera.coefficients,
         "lens_model": camera.lens_model,
         "focal_px": camera.focal,
-        "focal_source": camera.focal_source,
+        "focal_source": camera.focal_source or (None if camera.focal is None else "guess"),
     }
 
 

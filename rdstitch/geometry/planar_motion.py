@@ -104,10 +104,11 @@ def motions_from_homographies(homography: FloatArray, normal: FloatArray | None 
         return _motions_for_normals(homography, normal)
     h = homography / np.linalg.norm(homography, axis=(1, 2), keepdims=True)
     turned = h - np.eye(3) * np.trace(h, axis1=1, axis2=2)[:, None, None] / 3
-    normals = np.concatenate(
-        [np.swapaxes(np.linalg.eig(np.swapaxes(h, 1, 2))[1].real, 1, 2), np.linalg.svd(turned)[2][:, :1]], axis=1
-    )
-    motions = _motions_for_normals(np.repeat(h, 4, axis=0), normals.reshape(-1, 3)).reshape(-1, 4, 6)
+    level = np.broadcast_to([[0.0, 0.0, 1.0]], (len(h), 1, 3))  # of the identity any normal would do
+    eigenvectors = np.swapaxes(np.linalg.eig(np.swapaxes(h, 1, 2))[1].real, 1, 2)
+    normals = np.concatenate([level, eigenvectors, np.linalg.svd(turned)[2][:, :1]], axis=1)
+    count = normals.shape[1]
+    motions = _motions_for_normals(np.repeat(h, count, axis=0), normals.reshape(-1, 3)).reshape(-1, count, 6)
     rotation = rotation_from_tilt(motions[..., :2])
     fit = rotation @ rigid_in_plane(motions[..., 2], motions[..., 3:5], motions[..., 5]) @ np.swapaxes(rotation, -2, -1)
     fit = fit / np.linalg.norm(fit, axis=(-2, -1), keepdims=True)

@@ -39,7 +39,9 @@ def vote(distortion: ArrayLike, std: ArrayLike) -> Consensus:
     values, errors = values[able], np.maximum(errors[able], 1e-6)
     if not len(values):
         return Consensus(np.nan, np.inf, 0.0, values, errors, able[:0])
-    center, scatter = float(np.quantile(values, 0.5, weights=errors**-2, method="inverted_cdf")), 0.0
+    # To begin with, no pair outweighs others by being more certain than most.
+    weights = np.maximum(errors, np.median(errors)) ** -2
+    center, scatter = float(np.quantile(values, 0.5, weights=weights, method="inverted_cdf")), 0.0
     for rounds in range(_ROUNDS + 1):
         total = np.hypot(errors, scatter)
         inside = np.abs(values - center) <= 3.0 * total

@@ -16,9 +16,14 @@ SAME_FEATURE = 0.005
 def nearest_points(points: FloatArray, queries: FloatArray, count: int) -> tuple[FloatArray, IntArray]:
     """The nearest points of each query.
 
-    Of ``points`` (N, D), at least one, and ``queries`` (M, D): distances, ascending, and indices, both (M, K),
-    where K is the smaller of ``count`` and N.
+    Of finite ``points`` (N, D) and ``queries`` (M, D): distances, ascending, and indices, both (M, K), where K is the
+    smaller of ``count`` and N.
     """
+    if not (np.isfinite(points).all() and np.isfinite(queries).all()):
+        raise ValueError("points are not finite")  # OpenCV would give indices of none
+    if not len(points) or not len(queries):
+        shape = len(queries), min(count, len(points))
+        return np.zeros(shape), np.zeros(shape, dtype=np.intp)
     centre = points.mean(axis=0)  # of coordinates far from 0 float32 keeps little
     tree = cv2.flann.Index(np.ascontiguousarray(points - centre, np.float32), _SINGLE_TREE)
     indices, squared = tree.knnSearch(
@@ -33,6 +38,8 @@ def separate_neighbours(points: FloatArray) -> tuple[FloatArray, IntArray]:
     Of ``points`` (N, D), in half diagonals: distances and indices, both (N,). Where all of the three nearest are the
     same feature, the farthest of these, no farther than :data:`SAME_FEATURE`; the point itself where there is no other.
     """
+    if not len(points):
+        return np.zeros(0), np.zeros(0, dtype=np.intp)
     distance, index = nearest_points(points, points, _NEAREST + 1)
     first = (distance > SAME_FEATURE).argmax(axis=1)
     chosen = np.arange(len(points)), np.where(distance[:, -1] > SAME_FEATURE, first, -1)

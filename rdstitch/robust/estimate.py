@@ -57,6 +57,8 @@ class PairMatches:
             raise ArgumentError("quality has values that are NaN")
         if self.tilts is not None and self.tilts.shape != (2, 2):
             raise ArgumentError(f"tilts must have shape (2, 2), not {self.tilts.shape}")
+        if self.tilts is not None and not (np.abs(self.tilts) < np.pi / 2.0).all():
+            raise ArgumentError("tilts must be below a right angle, in radians")
 
     def __len__(self) -> int:
         """Number of matches."""
@@ -275,7 +277,7 @@ def _result(
     if not confident:
         reason += "; the search stopped at its limit of samples before it was confident"
     camera1, camera2 = (
-        replace(camera, distortion=fit.distortion, distortion_std=fit.distortion_std)
+        replace(camera, distortion=fit.distortion, distortion_std=fit.distortion_std or None)
         for camera in (pair.camera1, pair.camera2)
     )
     return RadialHomography(

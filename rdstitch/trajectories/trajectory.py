@@ -53,9 +53,15 @@ class Trajectory:
     covariance: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        counts = {len(values) for values in vars(self).values() if values is not None and len(values)}
-        if len(counts) > 1:
-            raise ArgumentError(f"a trajectory has one value of each kind a frame, not {sorted(counts)} of them")
+        count = len(self.frame)
+        shapes = {"position": (count, 2), "yaw": (count,), "height": (count,), "source_frame": (count,)}
+        shapes |= {"timestamp": (count,), "covariance": (count, 4, 4)}
+        for name, shape in shapes.items():
+            values = getattr(self, name)
+            if values is not None and np.shape(values) != shape:
+                raise ArgumentError(f"{name} of a trajectory of {count} frames has the shape {np.shape(values)}")
+        if len(self.name) not in (0, count):
+            raise ArgumentError(f"a trajectory of {count} frames has {len(self.name)} names")
 
     def labelled(self, names: Sequence[str], numbers: ArrayLike, timestamps: ArrayLike) -> Self:
         """The trajectory with name, number and time stamp of each image of the whole sequence."""

@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from scipy import sparse
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
@@ -20,8 +19,6 @@ from rdstitch.geometry.radial_homography import (
     transfer,
     transfer_jacobian,
 )
-from rdstitch.numerics.conjugate_gradients import conjugate_gradients
-from rdstitch.numerics.nearest_points import nearest_points, separate_neighbours
 from rdstitch.synthetic import FisheyeLens
 
 H = PlanarMotion((0.1, -0.2), 0.1, (0.2, -0.1), 1.1).homography() + 0.02 * np.arange(9).reshape(3, 3)
@@ -91,29 +88,6 @@ def test_cameras_are_of_whole_pixels_and_can_be_compared() -> None:
     for size in ((640.5, 480), (640,), 640):
         with pytest.raises(ArgumentError, match="whole numbers"):
             Camera(size)  # type: ignore[arg-type]
-
-
-def test_conjugate_gradients_reach_zero_from_a_start_that_is_not() -> None:
-    matrix = np.array([[5.0, -1.0], [-1.0, 5.0]])
-    right = np.array([[0.0, 4.0], [0.0, 4.0]])
-    with np.errstate(all="raise", under="ignore"):
-        found = conjugate_gradients(matrix, right, np.array([[3.0, 3.0], [-3.0, 1.0]]), lambda left: left / 5.0, 1e-9)
-    np.testing.assert_allclose(found, [[0.0, 1.0], [0.0, 1.0]], atol=1e-8)
-
-
-def test_conjugate_gradients_are_the_same_by_any_number_of_threads() -> None:
-    count = 60_000
-    matrix = sparse.csr_array(sparse.diags_array([2.001, -1.0, -1.0, 0.0], offsets=[0, 1, -1, 7], shape=(count,) * 2))
-    right = np.random.default_rng(0).normal(size=(count, 3))
-    found = [conjugate_gradients(matrix, right, 0.0 * right, lambda left: left, 1e-6, workers) for workers in (1, 3)]
-    np.testing.assert_array_equal(found[0], found[1])
-    assert np.abs(matrix @ found[0] - right).max() < 1e-3
-
-
-def test_conjugate_gradients_stop_where_a_matrix_is_not_positive() -> None:
-    right = np.ones((2, 1))
-    found = conjugate_gradients(np.diag([1.0, -1.0]), right, np.zeros((2, 1)), lambda left: left, 1e-9)
-    assert np.isfinite(found).all()
 
 
 def test_a_failed_fit_is_falsy_and_says_why() -> None:
@@ -232,22 +206,6 @@ def test_three_coefficients_describe_an_equidistant_fisheye() -> None:
     assert np.linalg.norm(lens.distort(fisheye.undistort(points)) - points, axis=1).max() < 0.1
 
 
-@pytest.mark.parametrize(("points", "queries", "dimensions"), [(1, 3, 2), (40, 7, 2), (900, 50, 3)])
-def test_the_nearest_points_are_those_of_all_distances(points: int, queries: int, dimensions: int) -> None:
-    rng = np.random.default_rng(points)
-    # Metres of a map projection: far from 0.
-    places, asked = (5e6 + 100.0 * rng.random((count, dimensions)) for count in (points, queries))
-    distances, indices = nearest_points(places, asked, 4)
-    expected = np.sort(np.linalg.norm(asked[:, None] - places, axis=2), axis=1)[:, :4]
-    np.testing.assert_allclose(distances, expected, atol=1e-4)
-    np.testing.assert_allclose(np.linalg.norm(asked[:, None] - places[indices], axis=2), expected, atol=1e-4)
-
-
-@pytest.mark.parametrize(("twins", "found"), [(0, True), (1, True), (2, True), (3, False)])
-def test_a_feature_that_is_found_several_times_is_no_neighbour_of_itself(twins: int, found: bool) -> None:
-    places = np.random.default_rng(0).uniform(-0.6, 0.6, (100, 2))
-    several = np.concatenate([places + 1e-3 * k * np.array([1.0, -1.0]) for k in range(twins + 1)])
-    distance, index = separate_neighbours(several)
-    assert (distance > 0.005).all() == found
-    assert (index % 100 != np.arange(len(several)) % 100).all() == found
-    assert separate_neighbours(places[:1])[1].tolist() == [0]
+def test_no_motion_is_that_of_a_level_camera() -> None:
+    found = PlanarMotion.from_homography(np.eye(3))
+    assert np.abs([*found.tilt, found.yaw, *found.translation]).max() < 1e-9

@@ -219,3 +219,9 @@ def test_votes_agree_within_three_standard_deviations_and_others_have_their_medi
         assert found.std == pytest.approx(offset / 2)
     assert vote([-0.5, -0.2, 0.1], [0.001] * 3).distortion == pytest.approx(-0.2, abs=0.01)
     assert vote([0.1, -0.6, -0.2, -0.5, 0.2], [0.001] * 5).distortion == pytest.approx(-0.2, abs=0.01)
+
+
+def test_one_pair_that_is_surer_than_the_others_does_not_overturn_them() -> None:
+    found = vote([0.1, 0.1, 0.1, -0.5], [0.01, 0.01, 0.01, 0.005])
+    assert found.distortion == pytest.approx(0.1)
+    assert found.agreeing.tolist() == [True, True, True, False]

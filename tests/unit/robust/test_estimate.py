@@ -32,6 +32,7 @@ TRUE = MATCHES.truth.motion
         ({"tilt": (np.nan, 0.2)}, "tilt must be"),
         ({"tilt": np.zeros((3, 2))}, "tilt must be"),
         ({"tilt": "a"}, "tilt must be an array of numbers"),
+        ({"tilt": (0.0, 2.0)}, "below a right angle"),
         ({"center": (340.0, 240.0), "image_size2": (480, 640)}, "turned by a quarter"),
         ({"quality": np.ones(7)}, "quality must have shape"),
         ({"quality": ["a"] * 150}, "quality must be an array of numbers"),

@@ -132,7 +132,7 @@ def test_covariances_are_right_of_frames_with_texture_and_without(
 
 
 def test_a_path_has_a_value_of_each_kind_a_frame() -> None:
-    with pytest.raises(ArgumentError, match="one value of each kind a frame"):
+    with pytest.raises(ArgumentError, match="a trajectory of 40 frames"):
         replace(_path(), name=("a.png", "b.png"))
 
 

@@ -98,3 +98,9 @@ def test_what_makes_no_path() -> None:
         Trajectory.from_poses(nothing)
     with pytest.raises(ArgumentError, match="height"):
         Trajectory.from_poses(_poses(), height=0.0)
+
+
+def test_arrays_of_a_path_have_one_shape_a_kind() -> None:
+    for position, yaw in ((np.zeros((0, 2)), np.zeros(3)), (np.zeros((3, 3)), np.zeros(3)), (np.zeros((3, 2)), [])):
+        with pytest.raises(ArgumentError, match="of a trajectory of 3 frames"):
+            Trajectory(np.arange(3), np.asarray(position), np.asarray(yaw), np.zeros(3))
