@@ -20,7 +20,7 @@ from rdstitch.io.metadata import Metadata
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.register import register
+from rdstitch.pipeline.registration.register import register
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Severity
 from rdstitch.results.placed_images import PlacedImages

@@ -36,7 +36,10 @@ _FUNCTIONS = {
     "detect and describe": ("rdstitch.features.detect:detect_view",),
     "match": ("rdstitch.matching.two_view:match_pairs",),
     "estimate pairs": ("rdstitch.matching.two_view:estimate_pairs",),
-    "adjust": ("rdstitch.pipeline.aligner:Aligner.draft", "rdstitch.pipeline.aligner:Aligner.completed"),
+    "adjust": (
+        "rdstitch.pipeline.registration.aligner:Aligner.draft",
+        "rdstitch.pipeline.registration.aligner:Aligner.completed",
+    ),
     "exposure and seams": (
         "rdstitch.compositing.survey:survey_images",
         "rdstitch.compositing.gain_compensation:estimate_exposure",

@@ -24,7 +24,7 @@ from rdstitch.executors import open_executor
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import read_sources
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.register import register
+from rdstitch.pipeline.registration.register import register
 from rdstitch.pipeline.run import Run
 from rdstitch.synthetic import BrownLens, FisheyeLens, RenderedSequence, grid_poses, ground, sequence_over
 from rdstitch.synthetic.lenses import Lens

@@ -35,10 +35,10 @@ from rdstitch.io import DecodedImage, Metadata
 from rdstitch.io.write import write_image
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.pipeline.aligner import Aligner
-from rdstitch.pipeline.lay_out import align_registration_locally
-from rdstitch.pipeline.redraft import draft_with_loops
-from rdstitch.pipeline.working_size import at_full_size
+from rdstitch.pipeline.composition.lay_out import align_registration_locally
+from rdstitch.pipeline.registration.aligner import Aligner
+from rdstitch.pipeline.registration.redraft import draft_with_loops
+from rdstitch.pipeline.registration.working_size import at_full_size
 from rdstitch.results.registration import Registration
 from rdstitch.synthetic import Photometry, RenderedSequence, blank, ground, sequence_over
 from rdstitch.system.cache import Cache

@@ -31,7 +31,7 @@ from rdstitch.arrays import FloatArray, IntArray
 from rdstitch.errors import RegistrationError
 from rdstitch.inputs.source import read_sources
 from rdstitch.options.tile_options import TileOptions
-from rdstitch.pipeline.flat_field import with_flat_field
+from rdstitch.pipeline.composition.flat_field import with_flat_field
 from rdstitch.pipeline.stage_tiles import place_tiles
 from rdstitch.stage import SearchPlan, TileGrid, register_tiles
 

@@ -18,11 +18,11 @@ from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.canvas_options import CanvasOptions
 from rdstitch.options.option import declared, options_of, with_fields
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.compose import CanvasPlan, compose_images
+from rdstitch.pipeline.composition.compose import CanvasPlan, compose_images
+from rdstitch.pipeline.composition.straighten import reoriented
 from rdstitch.pipeline.output_plan import OutputPlan
 from rdstitch.pipeline.replacements import read_replacements
 from rdstitch.pipeline.run import Run
-from rdstitch.pipeline.straighten import reoriented
 from rdstitch.pipeline.viewer_pages import plainly_viewed, write_page
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages, SavedGrid

@@ -22,20 +22,20 @@ from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside, ReportFil
 from rdstitch.options.option import check_parameter, options_of
 from rdstitch.options.shared_options import Height
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.accept import accept
-from rdstitch.pipeline.camera_path import camera_path
-from rdstitch.pipeline.choose_layout import choose_layout
-from rdstitch.pipeline.compose import compose_images
-from rdstitch.pipeline.lay_out import CandidateLayout
-from rdstitch.pipeline.map_canvas import check_map
+from rdstitch.pipeline.composition.choose_layout import choose_layout
+from rdstitch.pipeline.composition.compose import compose_images
+from rdstitch.pipeline.composition.lay_out import CandidateLayout
+from rdstitch.pipeline.composition.map_canvas import check_map
 from rdstitch.pipeline.output_plan import OutputPlan, report_refused, save_camera, stage_report
 from rdstitch.pipeline.read_inputs import in_order, read_inputs
-from rdstitch.pipeline.realign import aligner_of, with_reference_of
-from rdstitch.pipeline.register import register
+from rdstitch.pipeline.registration.accept import accept
+from rdstitch.pipeline.registration.camera_path import camera_path
+from rdstitch.pipeline.registration.realign import aligner_of, with_reference_of
+from rdstitch.pipeline.registration.register import register
+from rdstitch.pipeline.registration.working_size import at_full_size
 from rdstitch.pipeline.run import Run
 from rdstitch.pipeline.run_on_sources import blocks_on
 from rdstitch.pipeline.viewer_pages import viewed_images, write_page
-from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult

@@ -10,7 +10,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.options.apply_options import ApplyOptions
-from rdstitch.pipeline.flat_field import check_one_size, with_flat_field
+from rdstitch.pipeline.composition.flat_field import check_one_size, with_flat_field
 from rdstitch.results.messages import Message, left_out, merge_by_reason
 from rdstitch.sidecar.counterparts import counterparts
 from rdstitch.sidecar.read import SavedRegistration

@@ -24,8 +24,8 @@ from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside, ImageFile
 from rdstitch.options.option import options_of, with_fields
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.options.tile_options import TileOptions
-from rdstitch.pipeline.flat_field import NO_FLAT_FIELD, with_flat_field
-from rdstitch.pipeline.lay_out import lay_out
+from rdstitch.pipeline.composition.flat_field import NO_FLAT_FIELD, with_flat_field
+from rdstitch.pipeline.composition.lay_out import lay_out
 from rdstitch.pipeline.output_plan import OutputPlan
 from rdstitch.pipeline.recipes import compose_registration
 from rdstitch.pipeline.run import Run

@@ -51,7 +51,7 @@ class PlacedImages:
     turned: bool = False
     place: Georeference | None = None  # of the plane, where it is known from an earlier run
     tiles: bool = False  # of a stage: nothing of them is static, though their ground may be black
-    # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.straighten`
+    # (3, 3): what the homographies were turned by; see :mod:`rdstitch.pipeline.composition.straighten`
     orientation: FloatArray | None = None
     errors: AlignmentErrors = field(default_factory=AlignmentErrors)
     grid: SavedGrid | None = None  # pixels that the output is made on

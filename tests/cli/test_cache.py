@@ -10,7 +10,7 @@ import pytest
 from rdstitch_cli.main import run
 
 from rdstitch.matching import two_view
-from rdstitch.pipeline import detect_features
+from rdstitch.pipeline.registration import detect_features
 from rdstitch.verification import overlap_check
 from tests.cli.running import FAST, Run, finished, sidecar_of, start
 from tests.sampled import sampled

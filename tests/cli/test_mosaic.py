@@ -17,8 +17,9 @@ from rdstitch.inputs.find import FoundImages
 from rdstitch.io import read_image, write_image
 from rdstitch.matching import candidate_pairs
 from rdstitch.matching.pair_estimator import PairEstimator
-from rdstitch.pipeline import accept, blocks
+from rdstitch.pipeline import blocks
 from rdstitch.pipeline.recipes import stitch_images
+from rdstitch.pipeline.registration import accept
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.synthetic import RenderedSequence

@@ -16,7 +16,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.camera_record import camera_json
 from rdstitch.inputs import source as sources
 from rdstitch.io import Metadata, read_image, read_metadata
-from rdstitch.pipeline import accept, register
+from rdstitch.pipeline.registration import accept, register
 from rdstitch.sidecar import write
 from rdstitch.verification.verdict import judge
 from tests.cli.faulty import UNREADABLE, UNUSABLE

@@ -19,8 +19,9 @@ from rdstitch.compositing.seam_quality import SeamQuality
 from rdstitch.io import Metadata, preview, write_image
 from rdstitch.io.opening import MAX_IMAGE_GB
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline import accept, recipes
+from rdstitch.pipeline import recipes
 from rdstitch.pipeline.recipes import calibrate, pano
+from rdstitch.pipeline.registration import accept
 from rdstitch.report import mosaic as report
 from rdstitch.report import report_page, write_report
 from rdstitch.report.mosaic import seam_dots

@@ -17,7 +17,7 @@ from PIL import Image
 import rdstitch
 from rdstitch.export import map_server
 from rdstitch.pipeline import recipes
-from rdstitch.pipeline.register import register
+from rdstitch.pipeline.registration.register import register
 from tests.cli.running import CACHED, OPTIONS, Run, rows_of, sidecar_of
 
 

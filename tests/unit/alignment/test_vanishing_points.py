@@ -11,7 +11,7 @@ from rdstitch.alignment.frames.vanishing_points import Edges, Focal, nearest_axi
 from rdstitch.arrays import FloatArray
 from rdstitch.compositing import CompositeOptions
 from rdstitch.geometry.camera import Camera
-from rdstitch.pipeline import straighten
+from rdstitch.pipeline.composition import straighten
 from rdstitch.results.placed_images import PlacedImages
 from tests.registrations import source
 

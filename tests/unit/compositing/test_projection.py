@@ -22,7 +22,7 @@ from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import DecodedImage
-from rdstitch.pipeline.straighten import view_rotation
+from rdstitch.pipeline.composition.straighten import view_rotation
 from rdstitch.synthetic.rendering import Photometry
 
 LENS = Camera((160, 120), -0.2, focal=110.0, focal_source="option")

@@ -18,7 +18,7 @@ from rdstitch.executors import ProcessExecutor, in_order, open_executor, process
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import write_image
-from rdstitch.pipeline.detect_features import detect_batch
+from rdstitch.pipeline.registration.detect_features import detect_batch
 from rdstitch.system.cache import Cache
 from tests.unit.executors import tasks
 

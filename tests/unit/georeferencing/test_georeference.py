@@ -30,7 +30,7 @@ from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.io import ImageSpec, write_strips
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
-from rdstitch.pipeline.map_canvas import plan_on_map
+from rdstitch.pipeline.composition.map_canvas import plan_on_map
 from rdstitch.pipeline.output_messages import place_messages
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.report import report_page

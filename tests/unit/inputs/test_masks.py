@@ -23,7 +23,7 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io import DecodedImage, read_image
 from rdstitch.io.mask import Mask, mask_frame, read_mask
 from rdstitch.io.metadata import Metadata
-from rdstitch.pipeline.image_circle import with_image_circle
+from rdstitch.pipeline.registration.image_circle import with_image_circle
 from rdstitch.synthetic import FisheyeLens, grid_poses, ground, sequence_over
 from rdstitch.system.cache import Cache
 

@@ -25,7 +25,7 @@ from rdstitch.local_alignment.fit import Stiffness, fit_fields
 from rdstitch.local_alignment.matches import ImagesOnSurface, PlacedMatches, place_matches
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.numerics.robust_loss import RAYLEIGH_MEDIAN
-from rdstitch.pipeline.lay_out import align_registration_locally
+from rdstitch.pipeline.composition.lay_out import align_registration_locally
 from rdstitch.robust.per_image_distortion import _coherence
 from rdstitch.synthetic import RELIEFS, RenderedSequence, blank, grid_poses, sequence_over
 from tests.registrations import registration

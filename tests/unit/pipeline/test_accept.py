@@ -19,11 +19,11 @@ from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.accept import accept
-from rdstitch.pipeline.aligner import AlignedPairs, Aligner
-from rdstitch.pipeline.realign import realigned, without
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.pipeline.redraft import reselect_inliers, select_by_whole_lens
+from rdstitch.pipeline.registration.accept import accept
+from rdstitch.pipeline.registration.aligner import AlignedPairs, Aligner
+from rdstitch.pipeline.registration.realign import realigned, without
+from rdstitch.pipeline.registration.redraft import reselect_inliers, select_by_whole_lens
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message, left_out
 from rdstitch.system.cache import NO_CACHE
@@ -67,7 +67,7 @@ def test_what_remains_has_metric_poses_where_they_are_needed(monkeypatch: pytest
         return AlignedPairs((), replace(metric, poses=None) if aligner.options.model == "auto" else metric)
 
     monkeypatch.setattr(Aligner, "_drafted", aligned)
-    monkeypatch.setattr("rdstitch.pipeline.aligner.over_rough_ground", lambda pairs, threshold: pairs)
+    monkeypatch.setattr("rdstitch.pipeline.registration.aligner.over_rough_ground", lambda pairs, threshold: pairs)
     free = Aligner.of([], OPTIONS, NO_CACHE)
     assert free.align(()).alignment.poses is None
     assert replace(free, needs_poses=True).align(()).alignment.poses is not None

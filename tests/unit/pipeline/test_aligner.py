@@ -20,8 +20,8 @@ from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.two_view import PairRegistration
-from rdstitch.pipeline.aligner import Aligner
-from rdstitch.pipeline.redraft import draft_with_loops
+from rdstitch.pipeline.registration.aligner import Aligner
+from rdstitch.pipeline.registration.redraft import draft_with_loops
 from rdstitch.system.cache import NO_CACHE
 
 COPY = 12

@@ -17,13 +17,13 @@ from rdstitch.compositing import CompositeOptions, SeamBreak, SeamQuality
 from rdstitch.io import write_image
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.aligner import Aligner
-from rdstitch.pipeline.choose_layout import _alternatives, _differs, _error, _Trials, choose_layout
-from rdstitch.pipeline.compose import CanvasPlan
-from rdstitch.pipeline.lay_out import is_stretched
+from rdstitch.pipeline.composition.choose_layout import _alternatives, _differs, _error, _Trials, choose_layout
+from rdstitch.pipeline.composition.compose import CanvasPlan
+from rdstitch.pipeline.composition.lay_out import is_stretched
 from rdstitch.pipeline.output_messages import seam_messages
-from rdstitch.pipeline.realign import aligner_of, by_second_motions
 from rdstitch.pipeline.recipes import mosaic, pano
+from rdstitch.pipeline.registration.aligner import Aligner
+from rdstitch.pipeline.registration.realign import aligner_of, by_second_motions
 from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.registration import Registration
 from rdstitch.synthetic.textures import ground

@@ -4,7 +4,7 @@ import pytest
 
 from rdstitch.errors import LimitError
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.pipeline.map_canvas import plan
+from rdstitch.pipeline.composition.map_canvas import plan
 from rdstitch.results.placed_images import PlacedImages
 from tests.registrations import registration
 

@@ -17,8 +17,8 @@ from rdstitch.arrays import FloatArray
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
 from rdstitch.io import write_image
-from rdstitch.pipeline import register as stages
-from rdstitch.pipeline import repeated_patterns
+from rdstitch.pipeline.registration import register as stages
+from rdstitch.pipeline.registration import repeated_patterns
 from rdstitch.synthetic import ImageTexture, Photometry, RenderedSequence, grid_poses, ground, repeated, sequence_over
 from rdstitch.verification.unique_places import UniqueShift
 

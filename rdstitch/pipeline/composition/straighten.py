@@ -26,7 +26,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import nearest_rotation
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.upright_options import UprightOptions
-from rdstitch.pipeline.map_canvas import plan
+from rdstitch.pipeline.composition.map_canvas import plan
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages
 from rdstitch.verification.limits import Limits

@@ -8,10 +8,10 @@ from rdstitch.alignment.result import links_by_image
 from rdstitch.choices import ModelName
 from rdstitch.errors import PartialResultError
 from rdstitch.inputs.input_guard import InputGuard
-from rdstitch.pipeline.aligner import Aligner, impossible_estimates_fail
-from rdstitch.pipeline.realign import Rejected, aligner_of, left_out_images, plane_of_most, without
+from rdstitch.pipeline.registration.aligner import Aligner, impossible_estimates_fail
+from rdstitch.pipeline.registration.realign import Rejected, aligner_of, left_out_images, plane_of_most, without
+from rdstitch.pipeline.registration.working_size import at_full_size
 from rdstitch.pipeline.run import Run
-from rdstitch.pipeline.working_size import at_full_size
 from rdstitch.results.messages import merge_by_reason
 from rdstitch.results.registration import Registration
 from rdstitch.verification.evidence import ResultEvidence

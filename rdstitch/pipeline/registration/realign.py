@@ -10,7 +10,7 @@ from rdstitch.errors import RegistrationError
 from rdstitch.matching.copies import copies_of
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.aligner import AlignedPairs, Aligner
+from rdstitch.pipeline.registration.aligner import AlignedPairs, Aligner
 from rdstitch.results.messages import names_of
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import Cache

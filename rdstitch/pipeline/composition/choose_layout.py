@@ -25,8 +25,7 @@ from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.local_alignment import LocalAlignment, no_local_alignment
 from rdstitch.matching.copies import copies_of, without_copies
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.aligner import Aligner
-from rdstitch.pipeline.lay_out import (
+from rdstitch.pipeline.composition.lay_out import (
     IMAGE_GRID,
     CandidateLayout,
     align_registration_locally,
@@ -34,9 +33,10 @@ from rdstitch.pipeline.lay_out import (
     lay_out,
     straight_edges,
 )
-from rdstitch.pipeline.realign import by_second_motions, plane_of_most, realigned
-from rdstitch.pipeline.whole_pixels import on_whole_pixels
-from rdstitch.pipeline.working_size import at_full_size
+from rdstitch.pipeline.registration.aligner import Aligner
+from rdstitch.pipeline.registration.realign import by_second_motions, plane_of_most, realigned
+from rdstitch.pipeline.registration.whole_pixels import on_whole_pixels
+from rdstitch.pipeline.registration.working_size import at_full_size
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
 from rdstitch.verification.verdict import RefusedError

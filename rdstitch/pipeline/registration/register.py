@@ -17,13 +17,13 @@ from rdstitch.matching.pair_estimator import FeatureMatching, PairEstimator
 from rdstitch.matching.repeated_pattern import match_repeated_patterns
 from rdstitch.matching.static_background import without_static_background
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.aligner import Aligner, impossible_estimates_fail
-from rdstitch.pipeline.detect_features import detect_by_contrast
-from rdstitch.pipeline.image_circle import with_image_circle
-from rdstitch.pipeline.redraft import draft_with_loops
-from rdstitch.pipeline.repeated_patterns import match_crossings, settle_repeated_pattern
+from rdstitch.pipeline.registration.aligner import Aligner, impossible_estimates_fail
+from rdstitch.pipeline.registration.detect_features import detect_by_contrast
+from rdstitch.pipeline.registration.image_circle import with_image_circle
+from rdstitch.pipeline.registration.redraft import draft_with_loops
+from rdstitch.pipeline.registration.repeated_patterns import match_crossings, settle_repeated_pattern
+from rdstitch.pipeline.registration.working_size import at_working_size
 from rdstitch.pipeline.run import Run
-from rdstitch.pipeline.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import Cache

@@ -29,7 +29,7 @@ from rdstitch.io.formats import check_memory, check_size
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.options.upright_options import Corners
-from rdstitch.pipeline.map_canvas import place_on_canvas, plan_on_map
+from rdstitch.pipeline.composition.map_canvas import place_on_canvas, plan_on_map
 from rdstitch.pipeline.output_messages import (
     cut_away_messages,
     differing_profile_messages,

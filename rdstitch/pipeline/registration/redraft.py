@@ -10,7 +10,7 @@ from rdstitch.matching.candidate_pairs import loop_closures
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.numerics.robust_loss import sigma_of
-from rdstitch.pipeline.aligner import AlignedPairs, Aligner
+from rdstitch.pipeline.registration.aligner import AlignedPairs, Aligner
 
 _ROUNDS = 2  # of registering more pairs and selecting inliers again at most, each by what the one before has shown
 _SETTLED = 0.05  # share of the inliers that must have changed for the images to be aligned again

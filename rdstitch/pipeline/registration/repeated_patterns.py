@@ -20,7 +20,7 @@ from rdstitch.matching.repeated_pattern import rematch_elsewhere, shows_repeated
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.numerics.nearest_points import nearest_points
 from rdstitch.options.feature_options import CLOSER, WORK_MEGAPIXELS
-from rdstitch.pipeline.aligner import AlignedPairs, Aligner
+from rdstitch.pipeline.registration.aligner import AlignedPairs, Aligner
 from rdstitch.robust.chance import occupied_cells
 from rdstitch.verification.overlap_check import ComparedImages
 from rdstitch.verification.self_similarity import find_ambiguity

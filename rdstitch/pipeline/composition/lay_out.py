@@ -16,8 +16,8 @@ from rdstitch.inputs.source import Source
 from rdstitch.local_alignment import LocalAlignment, PutativeMatches, align_locally, no_local_alignment
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.pipeline.compose import CanvasPlan
-from rdstitch.pipeline.straighten import oriented
+from rdstitch.pipeline.composition.compose import CanvasPlan
+from rdstitch.pipeline.composition.straighten import oriented
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.registration import Registration

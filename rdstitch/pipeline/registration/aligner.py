@@ -24,8 +24,8 @@ from rdstitch.matching.copies import SAME_PX, copies_of, near_copies_of, without
 from rdstitch.matching.rough_ground import over_rough_ground
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.alignment_inputs import alignment_options, sightings
-from rdstitch.pipeline.working_size import at_working_size
+from rdstitch.pipeline.registration.alignment_inputs import alignment_options, sightings
+from rdstitch.pipeline.registration.working_size import at_working_size
 from rdstitch.results.messages import Message, names_of, shortened
 from rdstitch.system.cache import Cache
 from rdstitch.system.process_memory import return_freed_memory
