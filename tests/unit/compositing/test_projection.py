@@ -259,6 +259,15 @@ def test_viewers_are_told_where_a_part_of_a_full_turn_is(box: Box, left: int) ->
     assert 'GPano:CroppedAreaTopPixels="500"' in text
 
 
+def test_an_image_that_a_crop_of_a_full_turn_leaves_out_has_one_pixel() -> None:
+    canvas = plan_panorama([LENS] * 9, _directions(camera_rotations(np.arange(9) * 2 * np.pi / 9)))
+    middle = canvas.footprints[4].mean(axis=0)[0] % canvas.size[0]
+    far = round((middle + canvas.size[0] / 2) % canvas.size[0])
+    x0, y0, x1, _ = canvas.cropped((far, 0, far + 20, canvas.size[1])).box(4)
+    assert x1 - x0 == 1
+    assert y0 == 0
+
+
 NEAR = Camera((400, 300), distortion=-0.2, focal=300.0)
 FOCAL = 300.0 / NEAR.scale
 
