@@ -1,6 +1,8 @@
 """Tiles as microscopes' programs write them, made here by tifffile."""
 
 import json
+from collections.abc import Iterator
+from errno import EACCES
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from rdstitch.errors import ArgumentError
+from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.frame import Frame
 from rdstitch.io import read_image, read_metadata
 from rdstitch.io.stored_tiles import stored_tiles
@@ -143,6 +145,27 @@ def test_metadata_that_cannot_be_read_beside_tiles_says_nothing(tmp_path: Path) 
         (tile,) = stored_tiles([file])
         assert tile.is_plain
         assert tile.position is None
+
+
+def test_positions_are_folders_of_what_counts_as_an_image(tmp_path: Path) -> None:
+    for name in ("._b.tif", "Pos1/a.tif", "Pos2/a.dng", "Pos3/._a.tif", ".thumbnails/a.tif"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert with_position_folders([tmp_path]) == [tmp_path / "Pos1", tmp_path / "Pos2"]
+
+
+def test_a_folder_of_positions_that_cannot_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "Pos1").mkdir()
+    listed = Path.iterdir
+
+    def denied(folder: Path) -> Iterator[Path]:
+        if folder.name == "Pos1":
+            raise PermissionError(EACCES, "Permission denied")
+        return listed(folder)
+
+    monkeypatch.setattr(Path, "iterdir", denied)
+    with pytest.raises(InputError, match="Pos1: cannot read the folder: Permission denied"):
+        with_position_folders([tmp_path])
 
 
 def test_files_are_told_from_other_tiles_in_one_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
