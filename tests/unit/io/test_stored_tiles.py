@@ -189,3 +189,15 @@ def test_an_overview_beside_an_image_is_no_plane(tmp_path: Path) -> None:
         tiff.write(_planes(1)[0], metadata=None, photometric="minisblack")
         tiff.write(_planes(1)[0, ::2, ::2], subfiletype=1, metadata=None)
     assert stored_tiles([file])[0].is_plain
+
+
+def test_an_overview_between_planes_is_no_plane(tmp_path: Path) -> None:
+    file = tmp_path / "pyramids.tif"
+    with tifffile.TiffWriter(file) as tiff:
+        for plane in _planes(3):
+            tiff.write(plane, metadata=None, photometric="minisblack")
+            tiff.write(plane[::2, ::2] + 10, subfiletype=1, metadata=None, photometric="minisblack")
+    (tile,) = stored_tiles([file])
+    assert tile.counts == (1, 3, 1)
+    for z in range(3):
+        np.testing.assert_array_equal(tile.read(z, 0)[0], _planes(3)[z])
