@@ -62,9 +62,9 @@ class Canvas:
         """
         outline, (width, height) = self.footprints[index], self.size
         low, high = np.floor(outline.min(axis=0)), np.ceil(outline.max(axis=0)) + 1
-        shifts = self._shifts(float(low[0]), float(high[0]))
+        shifts = self._shifts(float(low[0]), float(high[0])) or [0.0]
         low[0], high[0] = low[0] + min(shifts), high[0] + max(shifts)
-        # Of an image beyond a grid that was given there is one pixel, in which it is not.
+        # Of an image beyond a grid that was given, or a crop, there is one pixel, in which it is not.
         x0, y0 = (min(max(0, int(v)), side - 1) for v, side in zip(low, (width, height), strict=True))
         return x0, y0, max(x0 + 1, min(width, int(high[0]))), max(y0 + 1, min(height, int(high[1])))
 

@@ -127,8 +127,10 @@ def photo_sphere_xmp(canvas: Canvas) -> bytes:
     full_width, full_height = round(TURN * resolution), round(TURN * resolution / 2.0)
     origin = canvas.matrix[:2, 2] + 0.5
     width, height = canvas.size
-    left = 0 if canvas.period is not None else min(max(round(full_width / 2 - origin[0]), 0), full_width - width)
-    top = min(max(round(full_height / 2 - origin[1]), 0), full_height - height)
+    left, top = round(full_width / 2 - origin[0]), round(full_height / 2 - origin[1])
+    if canvas.period is not None:
+        left %= full_width
+    left, top = max(0, min(left, full_width - width)), max(0, min(top, full_height - height))
     numbers = {
         "FullPanoWidthPixels": full_width,
         "FullPanoHeightPixels": full_height,

@@ -180,13 +180,13 @@ class ImageReader:
     def __call__(self, index: int, reduction: int = 1) -> DecodedImage:
         """Read image ``index``; a grey image among coloured ones becomes coloured."""
         placed = self._images[index]
+        called = placed.path or f"image {index + 1}"
         image = placed.read(reduction)
         height, width = image.pixels.shape[:2]
         wanted = reduced_size(placed.camera.image_size, reduction)
         if (width, height) != wanted:
             expected = "{} x {}".format(*wanted)
-            raise InputError(f"image {index + 1} has {width} x {height} pixels, but its camera has {expected}")
-        called = placed.path or f"image {index + 1}"
+            raise InputError(f"{called}: has {width} x {height} pixels, but its camera has {expected}")
         if self._samples is None:
             colours = (3,) if self._coloured and image.pixels.ndim == 2 else image.pixels.shape[2:]
             self._samples = colours, image.pixels.dtype, Path(called).name

@@ -95,17 +95,16 @@ class Detection:
 class PackedFeatures:
     """Features as they are stored: descriptors in a quarter or half of their size, which matching cannot tell apart."""
 
-    features: Features  # their descriptors are replaced by none
+    features: Features  # their descriptors are replaced by none, of the same type
     # (N, D). uint8: bits, or integers up to 255, such as SIFT's and nearly all of RootSIFT's; else float16, which is
     # finer than the grid of 1/512 of the largest norm on which descriptors are compared; float32 beyond its range
     descriptors: NDArray[Any]
-    bits: bool  # whether descriptors are bits
 
     @classmethod
     def pack(cls, features: Features) -> Self:
         """Pack the features of an image."""
         bare = replace(features, descriptors=np.zeros((len(features), 0), dtype=features.descriptors.dtype))
-        return cls(bare, _smallest(features.descriptors), features.binary)
+        return cls(bare, _smallest(features.descriptors))
 
     def take(self, index: NDArray[np.intp]) -> Self:
         """The features of the given indices, in their order."""
@@ -113,7 +112,8 @@ class PackedFeatures:
 
     def unpack(self) -> Features:
         """The features, with descriptors that can be compared."""
-        descriptors: Descriptors = self.descriptors if self.bits else self.descriptors.astype(np.float32)
+        binary = self.features.binary
+        descriptors: Descriptors = self.descriptors if binary else self.descriptors.astype(np.float32)
         return replace(self.features, descriptors=descriptors)
 
 

@@ -1,7 +1,6 @@
 """Images as the coefficients of their camera would have taken them, where its lens is another one."""
 
 from dataclasses import replace
-from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -46,7 +45,6 @@ def _places(camera: Camera, reduction: int, top: int, count: int, width: int) ->
     return np.asarray(whole[step : step + count, step : step + width] + pixel)
 
 
-@lru_cache(maxsize=2)  # images of one camera come one after the other
 def _moved(camera: Camera, reduction: int, top: int, count: int, width: int) -> tuple[int, NDArray[np.float64]]:
     """Pixels between nodes over ``count`` rows, and by how much the lens moves what is at each."""
     step = min(max(width // _NODES, 1), _MAX_STEP)

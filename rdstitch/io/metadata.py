@@ -49,7 +49,6 @@ MAX_PROFILE = 2**20 - 2**10
 _EXIF_OF_PNG = {"exif", "Raw profile type exif"}
 GREY_16 = ("I;16", "I;16B", "I;16L", "I;16N", "I")  # modes of Pillow's
 _COLOUR_SPACE = slice(16, 20)  # of a profile's header
-_HEADER = 16
 _INCHES = {2: 1.0, 3: 2.54}  # what pixels per unit are multiplied by
 
 
@@ -150,12 +149,14 @@ def _tiff_metadata(file: Path, stream: BinaryIO) -> Metadata:
 
 def _raw_metadata(file: Path) -> Metadata:
     size = raw_size(file)
-    # A small image carries the tags; its focal length is in its own pixels.
-    header = Image.new("L", (max(1, size[0] // _HEADER), max(1, size[1] // _HEADER)))
-    header.info["exif"] = raw_exif(file).tobytes()
-    metadata = metadata_of(header)
-    focal = None if metadata.focal_px is None else metadata.focal_px * size[0] / header.width
-    return replace(metadata, size=size, bit_depth=16, orientation=1, focal_px=focal)
+    exif = raw_exif(file)
+    photo = exif.get_ifd(ExifTags.IFD.Exif)
+    tags = ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight
+    width, height = (finite(photo.get(tag)) for tag in tags)
+    if width and height and (width - height) * (size[0] - size[1]) < 0:
+        # They are those of the sensor, of a camera that was held upright.
+        photo.update(zip(tags, (height, width), strict=True))
+    return _metadata(exif, {}, size, 16, 3)
 
 
 def metadata_of(image: Image.Image) -> Metadata:

@@ -147,10 +147,14 @@ def _stack(plain: StoredTile, tiff: "tifffile.TiffFile") -> StoredTile:
     leading = [
         (_LEADING.get(axis, "Z"), n) for axis, n in zip(series.axes, series.shape, strict=True) if axis not in "YXS"
     ]
-    if math.prod(n for _, n in leading) < 2:
+    count = math.prod(n for _, n in leading)
+    if count < 2:
         return plain
     planes = {}
-    for number, index in enumerate(np.ndindex(*(n for _, n in leading))):
+    pages = [page.index for page in series.pages if page is not None]
+    # ImageJ's stacks may have one directory for all planes.
+    numbers = pages if len(pages) == count else range(count)
+    for number, index in zip(numbers, np.ndindex(*(n for _, n in leading)), strict=True):
         at = {axis: k for (axis, _), k in zip(leading, index, strict=True)}
         planes[at.get("C", 0), at.get("Z", 0), at.get("T", 0)] = Page(plain.name, number)
     size, about = None, tiff.imagej_metadata or {}

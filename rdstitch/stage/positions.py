@@ -40,6 +40,10 @@ class Scan:
     order: ScanOrder = "rows"
     origin: Origin = "top-left"
 
+    def __post_init__(self) -> None:
+        if self.columns is not None and self.columns < 1:
+            raise ArgumentError(f"expected a number of columns from 1 on, not {self.columns}")
+
     def cell(self, number: int, count: int) -> tuple[int, int]:
         """Column and row of a tile, from the origin, of so many."""
         if self.columns is None:

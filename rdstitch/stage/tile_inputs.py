@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rdstitch.choices import ZPlane
 from rdstitch.errors import ArgumentError
 from rdstitch.inputs.frame import DeferredImage, Frame, Named, array_as_image, as_inputs, files_of
-from rdstitch.inputs.image_folders import READABLE_SUFFIXES, natural_key
+from rdstitch.inputs.image_folders import images_in, natural_key
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import DecodedImage, as_image
 from rdstitch.io.stored_tiles import StoredTile, stored_tiles
@@ -69,16 +69,12 @@ def with_position_folders(inputs: Sequence[Named]) -> list[Named]:
     named: list[Named] = []
     for item in inputs:
         folder = None if isinstance(item, Frame) or not Path(item).is_dir() else Path(item)
-        if folder is None or _has_images(folder):
+        if folder is None or images_in(folder):
             named.append(item)
             continue
-        inner = sorted((part for part in folder.iterdir() if part.is_dir()), key=natural_key)
-        named += [part for part in inner if _has_images(part)] or [item]
+        inner = [part for part in folder.iterdir() if part.is_dir() and not part.name.startswith(".")]
+        named += [part for part in sorted(inner, key=natural_key) if images_in(part)] or [item]
     return named
-
-
-def _has_images(folder: Path) -> bool:
-    return any(part.suffix.lower() in READABLE_SUFFIXES for part in folder.iterdir())
 
 
 def tile_frames(

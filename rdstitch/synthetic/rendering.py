@@ -69,6 +69,11 @@ class RenderedSequence:
     seed: int = 0
     samples: int | None = None
 
+    def __post_init__(self) -> None:
+        shape = np.shape(self.photometry.gain)
+        if shape not in ((1,), (len(self),)):
+            raise ArgumentError(f"expected one gain, or one for each of {len(self)} images, not of shape {shape}")
+
     def __len__(self) -> int:
         return len(self.poses)
 

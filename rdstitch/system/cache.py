@@ -74,6 +74,7 @@ class OnDisk(Generic[Value]):
         """Remove its file; it can not be loaded any more then."""
         with suppress(OSError):
             self.file.unlink()
+        _recent.forget(self.file)
 
 
 Stored = InMemory[Value] | OnDisk[Value]
@@ -229,6 +230,10 @@ class _RecentlyUsed:
             while self._free_bytes < 0 and self._held:
                 self._free_bytes += self._held.popitem(last=False)[1][1]
         return value
+
+    def forget(self, file: Path) -> None:
+        with self._lock, suppress(KeyError):
+            self._free_bytes += self._held.pop(file)[1]
 
 
 _recent = _RecentlyUsed(_CAPACITY)

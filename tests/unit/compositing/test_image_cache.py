@@ -189,6 +189,15 @@ def test_a_grey_image_before_coloured_ones_gets_colours() -> None:
     assert ImageReader(images[:1]).samples[0] == 1
 
 
+def test_an_image_of_another_size_is_named_by_its_file() -> None:
+    wrong = PlacedImage(partial(reduced, as_image(np.zeros((30, 41), np.uint8))), Camera((40, 30)), np.eye(3))
+    images = [wrong, wrong, replace(wrong, path="/a/bad.jpg")]
+    with pytest.raises(InputError, match=r"^/a/bad\.jpg: has 41 x 30 pixels, but its camera has 40 x 30$"):
+        ImageReader(images).part([2])(0)
+    with pytest.raises(InputError, match=r"^image 2: has 41 x 30 pixels"):
+        ImageReader(images)(1)
+
+
 def test_a_failed_prefetch_raises_where_the_image_is_read() -> None:
     decoded_images = DecodedImageCache()
     cache = decoded_images.cache(limit=80_000, ahead=True)
@@ -196,7 +205,7 @@ def test_a_failed_prefetch_raises_where_the_image_is_read() -> None:
     cache.prefetch([1, 2])
     wait_for_all_read_ahead(cache)
     assert decoded_images.reads[2] == 1
-    with pytest.raises(InputError, match="image 2 has 200 x 50 pixels"):
+    with pytest.raises(InputError, match="image 2: has 200 x 50 pixels"):
         cache.get(1)
 
 

@@ -1,6 +1,7 @@
 """Projections, the part of the ground that is near enough, and views that are turned upright."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from examples.worlds.turns import TurningSequence, camera_rotations, turning_seq
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import ProjectionName
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
+from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.canvas import plan_canvas
 from rdstitch.compositing.compositor import photo_sphere_xmp
 from rdstitch.compositing.panorama_canvas import center_of_view, choose_projection, field_of_view, seen_directions
@@ -240,6 +242,30 @@ def test_viewers_are_told_which_part_of_the_sphere_it_is() -> None:
     assert down == pytest.approx(high[1] - low[1], abs=2 / 110)
     assert center_of_view(canvas)[1] == pytest.approx((low[1] + high[1]) / 2, abs=1 / 110)
     assert photo_sphere_xmp(plan_panorama([LENS] * 9, _directions(rotations), projection="cylinder")) == b""
+
+
+@pytest.mark.parametrize(
+    ("box", "left"), [((0, 500, 4096, 1500), 0), ((1000, 500, 2000, 1500), 1000), ((3500, 500, 4500, 1500), 3096)]
+)
+def test_viewers_are_told_where_a_part_of_a_full_turn_is(box: Box, left: int) -> None:
+    """A part across the edge, which they cannot show, is beside it."""
+    whole = plan_panorama([LENS] * 9, _directions(camera_rotations(np.arange(9) * 2 * np.pi / 9)))
+    resolution = 4096 / (2 * np.pi)
+    matrix = np.array([[resolution, 0.0, 2047.5], [0.0, resolution, 1023.5], [0.0, 0.0, 1.0]])
+    canvas = replace(whole, size=(4096, 2048), matrix=matrix, period=4096.0).cropped(box)
+    text = photo_sphere_xmp(canvas).decode()
+    assert 'GPano:FullPanoWidthPixels="4096"' in text
+    assert f'GPano:CroppedAreaLeftPixels="{left}"' in text
+    assert 'GPano:CroppedAreaTopPixels="500"' in text
+
+
+def test_an_image_that_a_crop_of_a_full_turn_leaves_out_has_one_pixel() -> None:
+    canvas = plan_panorama([LENS] * 9, _directions(camera_rotations(np.arange(9) * 2 * np.pi / 9)))
+    middle = canvas.footprints[4].mean(axis=0)[0] % canvas.size[0]
+    far = round((middle + canvas.size[0] / 2) % canvas.size[0])
+    x0, y0, x1, _ = canvas.cropped((far, 0, far + 20, canvas.size[1])).box(4)
+    assert x1 - x0 == 1
+    assert y0 == 0
 
 
 NEAR = Camera((400, 300), distortion=-0.2, focal=300.0)

@@ -174,6 +174,26 @@ def test_raw_files(tmp_path: Path) -> None:
     assert np.corrcoef(levels, np.arange(len(levels)))[0, 1] > 0.9
 
 
+@pytest.mark.parametrize("size", [(6000, 4000), (4000, 6000)])
+def test_the_focal_length_of_a_raw_file_holds_for_its_image_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]
+) -> None:
+    """Its tags count pixels of the sensor, however the camera was held."""
+    tag = ExifTags.Base
+    exif = Image.Exif()
+    exif[tag.Model] = "Camera"
+    photo: dict[int, float] = {tag.FocalLength: 50.0, tag.FocalPlaneXResolution: 4000.0}
+    exif.get_ifd(ExifTags.IFD.Exif).update(photo | {tag.ExifImageWidth: 6000, tag.ExifImageHeight: 4000})
+    monkeypatch.setattr("rdstitch.io.metadata.raw_exif", lambda _: exif)
+    monkeypatch.setattr("rdstitch.io.metadata.raw_size", lambda _: size)
+    (tmp_path / "a.cr2").write_bytes(b"raw")
+    metadata = read_metadata(tmp_path / "a.cr2")
+    write_image(tmp_path / "a.jpg", np.zeros((size[1], size[0]), np.uint8), None, metadata)
+    focal = [metadata.focal_px, read_metadata(tmp_path / "a.jpg").focal_px]
+    assert focal == pytest.approx([50.0 / 25.4 * 4000.0] * 2)
+    assert (metadata.size, metadata.channels) == (size, 3)
+
+
 @pytest.mark.parametrize(("name", "package"), [("a.heic", "pillow_heif"), ("a.CR3", "rawpy")])
 def test_what_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, package: str) -> None:
     monkeypatch.setitem(sys.modules, package, None)

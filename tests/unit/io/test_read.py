@@ -239,13 +239,13 @@ def test_a_png_that_ends_early_is_no_image_without_metadata(tmp_path: Path) -> N
         read_metadata(file)
 
 
-def test_correction_of_a_lens_keeps_nothing_of_the_size_of_images() -> None:
+def test_correction_of_a_lens_keeps_nothing() -> None:
     model = LensModel((1500.0, 1500.0), (1000.0, 600.0), (-0.1, 0.01, 0.0, 0.0, 0.0))
     camera = Camera((2000, 1200), -0.1, lens_model=model)
     image = DecodedImage(np.zeros((1200, 2000), np.uint8), None, Metadata((2000, 1200)))
     tracemalloc.start()
     try:
         corrected(image, camera, 1)
-        assert tracemalloc.get_traced_memory()[0] < image.pixels.nbytes
+        assert tracemalloc.get_traced_memory()[0] < 2**17
     finally:
         tracemalloc.stop()

@@ -1,6 +1,8 @@
 """Tiles as microscopes' programs write them, made here by tifffile."""
 
 import json
+from collections.abc import Iterator
+from errno import EACCES
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from rdstitch.errors import ArgumentError
+from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.frame import Frame
 from rdstitch.io import read_image, read_metadata
 from rdstitch.io.stored_tiles import stored_tiles
@@ -145,6 +147,27 @@ def test_metadata_that_cannot_be_read_beside_tiles_says_nothing(tmp_path: Path) 
         assert tile.position is None
 
 
+def test_positions_are_folders_of_what_counts_as_an_image(tmp_path: Path) -> None:
+    for name in ("._b.tif", "Pos1/a.tif", "Pos2/a.dng", "Pos3/._a.tif", ".thumbnails/a.tif"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert with_position_folders([tmp_path]) == [tmp_path / "Pos1", tmp_path / "Pos2"]
+
+
+def test_a_folder_of_positions_that_cannot_be_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "Pos1").mkdir()
+    listed = Path.iterdir
+
+    def denied(folder: Path) -> Iterator[Path]:
+        if folder.name == "Pos1":
+            raise PermissionError(EACCES, "Permission denied")
+        return listed(folder)
+
+    monkeypatch.setattr(Path, "iterdir", denied)
+    with pytest.raises(InputError, match="Pos1: cannot read the folder: Permission denied"):
+        with_position_folders([tmp_path])
+
+
 def test_files_are_told_from_other_tiles_in_one_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stack = tmp_path / "stack.tif"
     tifffile.imwrite(stack, _planes(2), metadata=None)
@@ -166,3 +189,15 @@ def test_an_overview_beside_an_image_is_no_plane(tmp_path: Path) -> None:
         tiff.write(_planes(1)[0], metadata=None, photometric="minisblack")
         tiff.write(_planes(1)[0, ::2, ::2], subfiletype=1, metadata=None)
     assert stored_tiles([file])[0].is_plain
+
+
+def test_an_overview_between_planes_is_no_plane(tmp_path: Path) -> None:
+    file = tmp_path / "pyramids.tif"
+    with tifffile.TiffWriter(file) as tiff:
+        for plane in _planes(3):
+            tiff.write(plane, metadata=None, photometric="minisblack")
+            tiff.write(plane[::2, ::2] + 10, subfiletype=1, metadata=None, photometric="minisblack")
+    (tile,) = stored_tiles([file])
+    assert tile.counts == (1, 3, 1)
+    for z in range(3):
+        np.testing.assert_array_equal(tile.read(z, 0)[0], _planes(3)[z])

@@ -139,6 +139,11 @@ def test_running_numbers_go_to_and_fro_from_a_corner() -> None:
     np.testing.assert_array_equal(plate.places, [(0, 0), (10, 10)])
 
 
+def test_a_scan_without_columns_is_refused() -> None:
+    with pytest.raises(ArgumentError, match="columns"):
+        Scan(0)
+
+
 @pytest.mark.parametrize(
     ("pattern", "names"), [("r{row}", ["r1"]), ("r{row}c{col}", ["r1c1", "x"]), ("r{row}c{col}", ["r1c1_a", "r1c1_b"])]
 )

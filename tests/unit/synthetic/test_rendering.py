@@ -199,6 +199,12 @@ def test_what_cannot_be_rendered_is_refused_by_what_it_is(make: Callable[[], obj
         make()
 
 
+@pytest.mark.parametrize("gain", [np.ones(3), np.ones((1, 2))])
+def test_a_gain_is_one_for_all_images_or_one_an_image(gain: FloatArray) -> None:
+    with pytest.raises(ArgumentError, match="gain"):
+        RenderedSequence(blank((50, 50)), LENS, grid_poses(LENS, 2, 1), Photometry(gain=gain))
+
+
 def test_motion_between_poses_is_the_homography_between_images() -> None:
     poses = grid_poses(LENS, 3, 2, yaw=3.0, tilt=(0.1, -0.2)).shaken(seed=1, height=0.2)
     from_plane = poses.from_plane()

@@ -164,6 +164,16 @@ def test_an_entry_that_is_gone_is_named(tmp_path: Path, damage: str) -> None:
     assert str(found.file) in str(error.value)
 
 
+def test_an_entry_that_was_removed_is_no_longer_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache, "_recent", cache._RecentlyUsed(20_000))
+    found = _kept(tmp_path, "a", 1.0)
+    assert found.load() is found.load()
+    found.remove()
+    with pytest.raises(InputError, match="run again"):
+        found.load()
+    found.remove()
+
+
 def test_what_was_used_recently_stays_in_memory_within_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     entries = [Cache.at(tmp_path).stored("stage", (k,), lambda k=k: np.full(1000, k)) for k in range(4)]  # type: ignore[misc]
     monkeypatch.setattr(cache, "_recent", cache._RecentlyUsed(20_000))
