@@ -80,6 +80,12 @@ def test_options_within_options_are_of_their_class() -> None:
         TileOptions(distortion=3.0)
 
 
+def test_the_compositor_has_its_own_number_of_threads_where_it_is_given() -> None:
+    composite = CompositeOptions(workers=1)
+    assert StitchOptions(workers=2, composite=composite).compositing.workers == 1
+    assert StitchOptions(workers=2).compositing.workers == 2
+
+
 def test_the_class_says_what_its_options_are() -> None:
     assert "number\n    A number." in (_Options.__doc__ or "")
 
