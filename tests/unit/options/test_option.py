@@ -128,6 +128,7 @@ def test_arrays_become_tuples_of_numbers() -> None:
     [
         ({"max_size": 1200, "crop": "auto"}, {"extent": (0, 0, 1, 1)}, {"max_size": None, "crop": "none"}),
         ({"max_size": 1200}, {"scale": 1.0}, {"max_size": None}),
+        ({"max_size": 1200}, {"gsd": None}, {}),
         ({"max_size": 1200, "scale": 0.5}, {"scale": 2.0, "max_size": 9}, {}),
         ({"scale": 0.5, "rotate": 9.0}, {"like": "a.tif"}, {"scale": 1.0, "rotate": 0.0}),
         ({"like": "a.tif", "extent": (0, 0, 1, 1)}, {"gsd": 0.1}, {"like": None, "extent": None}),
