@@ -172,7 +172,7 @@ def map_summary(place: Georeference) -> str:
         agreeing = "GPS agree with the map" if place.source == GPS else f"{place.source} agree"
         count = f"{place.used} of {len(place.residuals)}"
         text += f"; {agreeing} to {metres(place.rms)} ({count}, each predicted by the others)"
-    if place.source == CONTROL:
+    if place.source == CONTROL and place.used:
         text += f", worst {_worst(place, place.residuals)}"
     return text if place.std is None else f"{text}; map ± {metres(place.std)}"
 
