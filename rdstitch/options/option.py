@@ -228,7 +228,7 @@ def checked(option: Declared, value: Any) -> Any:
     plain = _plain(value) if any(kind in (bool, int, float) or get_origin(kind) for kind in option.types) else value
     if not option.fits(plain):
         raise ArgumentError(f"{option.name} must be {option.expected}, not {value!r}")
-    return plain
+    return _with_floats(plain, option.types, option.option)
 
 
 def check_parameter(name: str, annotation: Any, value: Any) -> None:
@@ -244,6 +244,16 @@ def _plain(value: Any) -> Any:
         value = value.tolist()
     is_list = isinstance(value, Sequence) and not isinstance(value, str | bytes)
     return tuple(map(_plain, value)) if is_list else value
+
+
+def _with_floats(value: Any, types: Sequence[Any], option: Option) -> Any:
+    """The same with floats for whole numbers where the type that it fits has floats."""
+    kind = next((each for each in types if _fits(value, each, option)), None)
+    if get_origin(kind) is tuple:
+        parts = get_args(kind)
+        kinds = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
+        return tuple(_with_floats(item, [part], option) for item, part in zip(value, kinds, strict=True))
+    return float(value) if kind is float else value
 
 
 def documented(kind: Class) -> Class:

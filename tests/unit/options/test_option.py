@@ -49,6 +49,20 @@ def test_texts_become_paths_and_lists_tuples() -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "value", "held"),
+    [
+        ("number", 2, "2.0"),
+        ("count", 2, "2"),
+        ("sides", np.array([1, 2]), "(1.0, 2.0)"),
+        ("lines", [[0, 1]], "((0.0, 1.0),)"),
+        ("switch", True, "True"),
+    ],
+)
+def test_whole_numbers_are_floats_where_the_type_says_so(name: str, value: Any, held: str) -> None:
+    assert repr(getattr(_Options(**{name: value}), name)) == held
+
+
+@pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
         ("number", 0.0, "a number above 0 and of at most 10"),
