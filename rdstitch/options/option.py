@@ -6,7 +6,7 @@ large is imported here or by the modules of the options, so that ``--help`` is q
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum, StrEnum, auto
 from inspect import isclass
@@ -212,13 +212,13 @@ def files_in(*named: str | Path | None) -> list[Path]:
     return [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
 
 
-def with_fields(options: AnyOptions, given: dict[str, Any]) -> AnyOptions:
-    """The same options with other values; a name that is none of theirs is refused."""
+def with_fields(options: AnyOptions, given: dict[str, Any], others: Iterable[str] = ()) -> AnyOptions:
+    """The same options with other values; a name that is none of theirs is refused, ``others`` may be what is meant."""
     known = [each.name for each in fields(options)]
     for name in given.keys() - set(known):
         from difflib import get_close_matches
 
-        close = "".join(f"; do you mean {each!r}?" for each in get_close_matches(name, known, n=1))
+        close = "".join(f"; do you mean {each!r}?" for each in get_close_matches(name, [*known, *others], n=1))
         raise ArgumentError(f"{type(options).__name__} has no option {name!r}{close}")
     return replace(options, **given)
 

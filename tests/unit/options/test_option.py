@@ -170,6 +170,8 @@ def test_what_contradicts_or_is_unknown_is_refused() -> None:
     for recipe, inputs in ((rdstitch.apply, ("none.json", "none")), (rdstitch.tiles, ("none",))):
         with pytest.raises(ArgumentError, match="no option 'overwite'; do you mean 'overwrite'"):
             recipe(*inputs, overwite=True)
+    with pytest.raises(ArgumentError, match="no option 'scal'; do you mean 'scale'"):
+        rdstitch.apply("none.json", ["none"], scal=0.5)
     for wrong in ({"layout": "kiti"}, {"height": 0}, {"frame": "map"}):
         with pytest.raises(ArgumentError, match=f"{next(iter(wrong))} must be"):
             rdstitch.trajectory("none", **wrong)
