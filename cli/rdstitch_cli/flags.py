@@ -178,7 +178,7 @@ class EnteredValue(click.ParamType):  # type: ignore[type-arg]  # generic since 
         """The value of a text."""
         if not isinstance(value, str) or value in self.entry.words:
             return value
-        if value == self.entry.option.none:
+        if value and value == self.entry.option.none:
             return None
         for kind in self.entry.types:
             with suppress(ValueError, OverflowError):

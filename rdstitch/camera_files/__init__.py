@@ -27,6 +27,7 @@ from rdstitch.choices import CameraFormat
 from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.camera_record import CameraRecord, camera_json
+from rdstitch.options.option import check_parameter
 from rdstitch.system.file_access import read_text
 from rdstitch.system.outputs import json_bytes, text_bytes, write_bytes_atomic
 from rdstitch.system.records import convert, parse_json, parse_yaml
@@ -145,6 +146,8 @@ def save_camera(camera: Camera, path: str | Path, camera_format: CameraFormat = 
 
     Raises
     ------
+    ArgumentError
+        When there is no such format.
     OutputError
         When the name says none, or the file cannot be written.
     """
@@ -158,6 +161,7 @@ def camera_file_text(camera: Camera, path: str | Path, camera_format: CameraForm
 
 def format_of(path: str | Path, camera_format: CameraFormat = "auto") -> CameraFormat:
     """The format of a camera file that is written: the one that is wanted, or what its name says."""
+    check_parameter("camera_format", CameraFormat, camera_format)
     if camera_format != "auto":
         return camera_format
     file = Path(path)

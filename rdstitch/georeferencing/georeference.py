@@ -8,8 +8,9 @@ import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 from pathlib import Path
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 from msgspec import Struct, field
@@ -20,11 +21,15 @@ from rdstitch.geometry.crs import Crs, middle
 from rdstitch.georeferencing.camera_views import as_complex
 from rdstitch.io.tiff import ExtraTag
 
-PositionKind = Literal["GPS positions", "ground control points"]
-GPS: PositionKind = "GPS positions"
-CONTROL: PositionKind = "ground control points"
 _MODEL_SCALE, _MODEL_TIEPOINT, _MODEL_TRANSFORMATION, _GEO_KEYS = 33550, 33922, 34264, 34735
 _SHORT, _DOUBLE = 3, 12
+
+
+class PositionKind(StrEnum):
+    """What positions are of, as the sidecar and sentences have it."""
+
+    GPS = "GPS positions"
+    CONTROL = "ground control points"
 
 
 class Residual(Struct, frozen=True):
@@ -56,7 +61,7 @@ class Georeference:
     origin: complex  # easting + i northing of the centre of the top-left pixel, m
     # root mean square distance of the positions used from where all others and the images put them, m; None of a grid
     rms: float | None = None
-    source: PositionKind = GPS  # what the positions are
+    source: PositionKind = PositionKind.GPS  # what the positions are
     residuals: tuple[Residual, ...] = ()  # of every position
     # standard deviation of one coordinate of a place on the ground, in the mean over the positions, m
     std: float | None = None
@@ -169,10 +174,10 @@ def map_summary(place: Georeference) -> str:
     turned = "" if place.north_up else f", north {abs(place.clockwise_deg):.1f}° {side} of up"
     text = f"georeferenced: {place.crs.name}, {place.gsd:.4g} m a pixel{turned}"
     if place.rms is not None:
-        agreeing = "GPS agree with the map" if place.source == GPS else f"{place.source} agree"
+        agreeing = "GPS agree with the map" if place.source is PositionKind.GPS else f"{place.source} agree"
         count = f"{place.used} of {len(place.residuals)}"
         text += f"; {agreeing} to {metres(place.rms)} ({count}, each predicted by the others)"
-    if place.source == CONTROL:
+    if place.source is PositionKind.CONTROL and place.used:
         text += f", worst {_worst(place, place.residuals)}"
     return text if place.std is None else f"{text}; map ± {metres(place.std)}"
 

@@ -11,7 +11,7 @@ from rdstitch.geometry.crs import WGS84, Crs, middle
 from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.georeferencing.camera_views import Views, as_complex, views_of
-from rdstitch.georeferencing.georeference import CONTROL, GPS, Georeference, PositionKind, Residual, metres
+from rdstitch.georeferencing.georeference import Georeference, PositionKind, Residual, metres
 from rdstitch.georeferencing.map_fit import MapFit, Measured, fit_map
 from rdstitch.inputs.source import Source
 
@@ -58,7 +58,7 @@ def place_on_map(
     """
     points = _control_points(sources, to_output)
     control = [(point, pixel) for point, pixel in points if not point.check]
-    count, what = len(control), f"{len(control)} {CONTROL} are in the images"
+    count, what = len(control), f"{len(control)} {PositionKind.CONTROL} are in the images"
     if not control:
         count = sum(source.metadata.gps is not None for source in sources)
         what = f"{count} of {len(sources)} images have a GPS position"
@@ -94,7 +94,9 @@ def _of_positions(sources: Sequence[Source], views: Views, errors: AlignmentErro
     places = {k: source.metadata.gps for k, source in enumerate(sources) if source.metadata.gps is not None}
     known = np.array(list(places), dtype=np.intp)
     leverage = np.array(errors.leverage or [0.0] * len(sources))[known]
-    return _KnownPlaces(GPS, [sources[k].name for k in places], list(places.values()), views.take(known), leverage)
+    return _KnownPlaces(
+        PositionKind.GPS, [sources[k].name for k in places], list(places.values()), views.take(known), leverage
+    )
 
 
 def _of_control(
@@ -105,7 +107,7 @@ def _of_control(
     names = [point.name for point, _ in control]
     leverage = np.array([errors.control_leverage.get(name, 0.0) for name in names])
     ground = Views.of_ground(np.array([pixel for _, pixel in control]), views.pixel)
-    return _KnownPlaces(CONTROL, names, places, ground, leverage)
+    return _KnownPlaces(PositionKind.CONTROL, names, places, ground, leverage)
 
 
 def _control_points(sources: Sequence[Source], to_output: FloatArray) -> list[tuple[GroundControl, complex]]:
@@ -126,7 +128,7 @@ def _placed(
 ) -> tuple[Georeference | None, str]:
     source, names, views = known.source, known.names, known.views
     latitude, longitude = np.array([(place.latitude, place.longitude) for place in known.places]).T
-    if source == GPS and not (np.ptp(latitude) or np.ptp(longitude)):
+    if source is PositionKind.GPS and not (np.ptp(latitude) or np.ptp(longitude)):
         return None, "all images have the same GPS position"
     crs = Crs.nearest(latitude, longitude) if epsg is None else Crs(epsg)
     map_scale = crs.map_scale(*middle(latitude, longitude))
@@ -165,7 +167,7 @@ def _placed(
         residuals=tuple(map(Residual.of, names, off.tolist(), used.tolist())),
         std=None if fit.std is None else math.hypot(fit.std, hills * abs(fit.scale)),
         map_scale=map_scale,
-        assumption=_assumption(views, fit) if source == GPS else "",
+        assumption=_assumption(views, fit) if source is PositionKind.GPS else "",
     )
     return place, reason
 

@@ -81,7 +81,7 @@ class CanvasOptions(UprightOptions):
         scalars = {name: value for name, value in given.items() if isinstance(value, str | int | float | None)}
         stated = given.keys() - {name for name, value in scalars.items() if value in (None, "none", 0.0)}
         replaced = {other for name in stated for each in self.contradictions for other in each.against(name)}
-        if {"scale", "gsd"} & given.keys():
+        if {"scale", "gsd"} & stated:
             replaced.add("max_size")  # it would reduce them
         if given.get("georeference") == "off":
             replaced |= {"gsd", "like", "extent"}

@@ -6,7 +6,7 @@ large is imported here or by the modules of the options, so that ``--help`` is q
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum, StrEnum, auto
 from inspect import isclass
@@ -212,13 +212,13 @@ def files_in(*named: str | Path | None) -> list[Path]:
     return [file for path in given for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
 
 
-def with_fields(options: AnyOptions, given: dict[str, Any]) -> AnyOptions:
-    """The same options with other values; a name that is none of theirs is refused."""
+def with_fields(options: AnyOptions, given: dict[str, Any], others: Iterable[str] = ()) -> AnyOptions:
+    """The same options with other values; a name that is none of theirs is refused, ``others`` may be what is meant."""
     known = [each.name for each in fields(options)]
     for name in given.keys() - set(known):
         from difflib import get_close_matches
 
-        close = "".join(f"; do you mean {each!r}?" for each in get_close_matches(name, known, n=1))
+        close = "".join(f"; do you mean {each!r}?" for each in get_close_matches(name, [*known, *others], n=1))
         raise ArgumentError(f"{type(options).__name__} has no option {name!r}{close}")
     return replace(options, **given)
 
@@ -228,7 +228,7 @@ def checked(option: Declared, value: Any) -> Any:
     plain = _plain(value) if any(kind in (bool, int, float) or get_origin(kind) for kind in option.types) else value
     if not option.fits(plain):
         raise ArgumentError(f"{option.name} must be {option.expected}, not {value!r}")
-    return plain
+    return _with_floats(plain, option.types, option.option)
 
 
 def check_parameter(name: str, annotation: Any, value: Any) -> None:
@@ -244,6 +244,16 @@ def _plain(value: Any) -> Any:
         value = value.tolist()
     is_list = isinstance(value, Sequence) and not isinstance(value, str | bytes)
     return tuple(map(_plain, value)) if is_list else value
+
+
+def _with_floats(value: Any, types: Sequence[Any], option: Option) -> Any:
+    """The same with floats for whole numbers where the type that it fits has floats."""
+    kind = next((each for each in types if _fits(value, each, option)), None)
+    if get_origin(kind) is tuple:
+        parts = get_args(kind)
+        kinds = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
+        return tuple(_with_floats(item, [part], option) for item, part in zip(value, kinds, strict=True))
+    return float(value) if kind is float else value
 
 
 def documented(kind: Class) -> Class:

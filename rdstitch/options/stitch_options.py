@@ -175,7 +175,7 @@ class StitchOptions(RansacOptions, RunOptions):
     @property
     def compositing(self) -> CompositeOptions:
         """Options of the compositor, which works on as many tiles at a time."""
-        return replace(self.composite, workers=self.threads)
+        return replace(self.composite, workers=self.composite.workers or self.threads)
 
     @property
     def threads(self) -> int:

@@ -79,7 +79,7 @@ def apply(
     """
     of_composite = declared(CompositeOptions).keys() - declared(ApplyOptions).keys()
     composing = {name: fields.pop(name) for name in of_composite & fields.keys()}
-    options = with_fields(options_of(ApplyOptions, options), fields)
+    options = with_fields(options_of(ApplyOptions, options), fields, of_composite)
     saved = sidecar if isinstance(sidecar, SavedRegistration) else read_sidecar(sidecar)
     mismatch = mismatch_with_image(saved)
     if options.strict and mismatch:

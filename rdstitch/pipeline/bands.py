@@ -18,12 +18,14 @@ from rdstitch.inputs.source import read_sources
 from rdstitch.io import ImageSpec, write_strips
 from rdstitch.io.fingerprint import fingerprint
 from rdstitch.io.metadata import Metadata
+from rdstitch.io.ome_tiff import OME_SUFFIXES
 from rdstitch.io.strips import Strip
 from rdstitch.io.tiff import written_strips
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply_run, apply_to_images
+from rdstitch.pipeline.output_plan import file_of_part
 from rdstitch.pipeline.recipes import stitch_images
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
@@ -64,7 +66,7 @@ def mosaic_bands(
     no number of bands have only the latter. Given are the first band, and the others, each by its own lens.
     """
     file = Path(output)
-    files = [file.with_name(f"{file.stem}-{name}{file.suffix}") for name in bands]
+    files = [file_of_part(file, name) for name in bands]
     run = Run.of(inputs, options, Purpose.MOSAIC, files[0], beside=beside, every=every, progress=progress)
     options, outputs = run.options, run.outputs
     if options.dry_run:
@@ -73,7 +75,8 @@ def mosaic_bands(
     with run.open_images(file, *files[1:]) as images:  # all are published together
         frames = selected(images.frames, options.exclude, options.include_only)
         chosen = _by_band(frames, bands)
-        _check_alike(dict(zip(bands, chosen, strict=True)), in_one_file=bool(stack))
+        is_ome = file.name.lower().endswith(OME_SUFFIXES)
+        _check_alike(dict(zip(bands, chosen, strict=True)), in_one_file=bool(stack), is_ome=is_ome)
         whole = replace(run.options, exclude=(), include_only=())
         run = replace(run, options=whole, read=[*run.read, *images.files])
         of_first = replace(images, frames=chosen[0])
@@ -91,7 +94,7 @@ def mosaic_bands(
     return first, others
 
 
-def _check_alike(bands: Mapping[str, list[Frame]], *, in_one_file: bool) -> None:
+def _check_alike(bands: Mapping[str, list[Frame]], *, in_one_file: bool, is_ome: bool) -> None:
     """Refuse before long work bands whose images have other sizes than the first's, or which one file cannot hold."""
     kinds = {}
     for name, frames in bands.items():
@@ -99,6 +102,8 @@ def _check_alike(bands: Mapping[str, list[Frame]], *, in_one_file: bool) -> None
         if not sources:
             raise InputError(f"{unread[0].images[0]}: {unread[0].text}; no other image of {name} can be read either")
         read = [source.metadata for source in sources]
+        if is_ome and any(one.planes or one.channels not in (1, 3) for one in read):  # each is read from one page
+            raise ArgumentError(f"bands: images of {name} are neither grey nor RGB, as an OME-TIFF needs; name a .tif")
         bits = {next(depth for depth in (8, 16, 64) if one.bit_depth <= depth) for one in read}
         kinds[name] = {"{} x {} pixels".format(*one.size) for one in read}, {f"{depth} bits" for depth in bits}
     first = next(iter(bands))

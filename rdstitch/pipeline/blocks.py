@@ -12,6 +12,7 @@ from rdstitch.inputs.selection import selected
 from rdstitch.inputs.times import with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.pipeline.output_plan import file_of_part
 from rdstitch.pipeline.recipes import stitch_images
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
@@ -58,7 +59,7 @@ def mosaic_blocks(
             images, frames=list(with_times(images.frames, options.timestamps)), notes=(*images.notes, *run.notes)
         )
         frames = selected(images.frames, options.exclude, options.include_only)
-        names = [file, *(file.with_name(f"{file.stem}-{k}{file.suffix}") for k in range(2, len(frames) // 2 + 1))]
+        names = [file, *(file_of_part(file, k) for k in range(2, len(frames) // 2 + 1))]
         cached = replace(run.options, cache=cache, timestamps=None)
         run = replace(run, options=cached, notes=(), keeps_cache=options.cache is not None)
         further = names[1:]

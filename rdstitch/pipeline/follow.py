@@ -184,9 +184,10 @@ class Tracker:
         wheels = (math.nan,) if odometry is None else _measured("odometry", odometry, 3)
         body = BodyPose(*wheels) if all(map(math.isfinite, wheels)) else None
         number = next(self._numbers)
-        named, *more = as_inputs(image, self._options.channel_order)
-        if more:
-            raise ArgumentError(f"image must be one image, not {len(more) + 1}")
+        inputs = as_inputs(image, self._options.channel_order)
+        if len(inputs) != 1:
+            raise ArgumentError(f"image must be one image, not {len(inputs)}")
+        (named,) = inputs
         frame = replace(named, path=Path(f"image_{number:04d}")) if isinstance(named, Frame) else Frame(Path(named))
         frame = replace(frame, number=number, timestamp=time)
         *revised, pose = self.register(self.read(frame, tilt), body)

@@ -26,6 +26,12 @@ from rdstitch.viewer.page import viewer_path
 _REPORT_SUFFIXES = (".html", ".htm")
 
 
+def file_of_part(file: Path, part: str | int) -> Path:
+    """The file of a block or of a band, of the same format: ``field-2.tif``, ``field-NIR.ome.tif``."""
+    stem = file.stem[:-4] if file.stem.lower().endswith(".ome") else file.stem
+    return file.with_name(f"{stem}-{part}{file.name.removeprefix(stem)}")
+
+
 @dataclass(frozen=True)
 class PlannedFile:
     """What is written beside an image, which is kept where this fails."""

@@ -203,7 +203,7 @@ def _placed(
     if len({source.camera.image_size for source in sources}) > 1:
         text = "tiles of several sizes have no flat field in common"
         illumination = [Message(text, severity="note", code="flat-field")]
-        if options.flat_field not in ("auto", "off") or isinstance(options.distortion, float):
+        if options.flat_field not in ("auto", "off") or options.distortion not in (None, "auto", 0.0):
             raise ArgumentError("tiles of several sizes have neither a flat field nor a lens in common")
     else:
         sources, illumination = with_flat_field(sources, options.flat_field)

@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 from rdstitch.choices import ProjectionName
 from rdstitch.compositing.panorama_canvas import center_of_view, field_of_view
 from rdstitch.geometry.crs import Crs
-from rdstitch.georeferencing.georeference import GPS, Georeference, PositionKind, Residual
+from rdstitch.georeferencing.georeference import Georeference, PositionKind, Residual
 from rdstitch.results.stitch_result import OutputImage
 from rdstitch.system.records import Count, Matrix, NonNegative, Pair, Positive, Size, Triple, check_invertible
 
@@ -68,7 +68,7 @@ class GeoreferenceRecord(Struct, kw_only=True):
             complex(a, b),
             complex(east, north),
             self.rms_m,
-            self.source or GPS,
+            self.source or PositionKind.GPS,
             self.residuals,
             self.std_m,
             math.hypot(a, b) / (self.gsd_m or math.hypot(a, b)),

@@ -51,6 +51,7 @@ def _check(rdstitch: Run, folder: Path, arguments: list[str], status: int, *told
     [
         # Mistyped.
         ("mosaic  -o out.png", 2, "a name is empty"),
+        ("pano a.png b.png -o out.png --focal= --seed 1", 2, "'--focal': expected a number"),
         ("panos a.png b.png -o out.png", 2, "No such command 'panos'"),
         ("pano a.png b.png", 2, "'-o'"),
         (PANO + "--colour", 2, "--colour"),
@@ -164,6 +165,7 @@ def _tables() -> list[tuple[str, int, str | tuple[str, ...], Files]]:
         ("[pano]\nscale = true\n", "pano.scale", "a number"),
         ("[pano]\nseed = 1.5\n", "pano.seed", "a whole number"),
         ("[pano]\nseed = -1\n", "pano.seed", "-1"),
+        ("[pano]\nmax-size = ''\n", "pano.max-size", "a whole number"),
         ("[pano]\nstrict = 1\n", "pano.strict", "true or false"),
         ("[pano]\nblend = 'magic'\n", "pano.blend", "feather"),
         ("[pano]\ntilt = [1, 2]\n", "pano.tilt", "a text"),

@@ -18,7 +18,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.camera_files import export_note, load_camera, read_camera_file, save_camera
 from rdstitch.camera_files.polynomials import fitted_polynomial, kept_at_unit, terms_in
 from rdstitch.choices import CameraFormat, FocalSource
-from rdstitch.errors import InputError, OutputError
+from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
 from rdstitch.system.records import parse_yaml
@@ -655,6 +655,12 @@ def test_a_lens_of_any_sign_keeps_its_scale_at_the_unit_radius(distortion: float
 def test_a_format_needs_no_name(camera_format: CameraFormat, tmp_path: Path) -> None:
     save_camera(CAMERAS[0], tmp_path / "lens", camera_format)
     assert load_camera(tmp_path / "lens").distortion == pytest.approx(CAMERAS[0].distortion, abs=0.01)
+
+
+def test_an_unknown_format_is_refused_and_the_known_are_named(tmp_path: Path) -> None:
+    unknown: Any = "opencv-xml"
+    with pytest.raises(ArgumentError, match=r"camera_format must be one of auto, rdstitch, .*, not 'opencv-xml'"):
+        save_camera(CAMERAS[0], tmp_path / "lens.json", unknown)
 
 
 BROWN = [-0.2, 0.03, 0.003, 0.002], [-0.2, 0.03, 0.003, 0.002, 0.01], [-0.2, 0.05, 0, 0, 0.01, 0.02, 0.003, 0.001]

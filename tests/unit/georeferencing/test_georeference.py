@@ -295,6 +295,8 @@ def test_control_points_place_the_output_instead_of_positions() -> None:
     )
     assert max(r.distance for r in place.residuals if r.used) < 0.01
     few = [points if k < 2 else [] for k, points in enumerate(control)]
+    assert "worst" in map_summary(place)
+    assert "worst" not in map_summary(replace(place, residuals=()))  # as a sidecar may have it
     assert replace(row, control=few).place()[1] == ("2 ground control points are in the images, and 3 are needed")
 
 

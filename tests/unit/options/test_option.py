@@ -49,6 +49,20 @@ def test_texts_become_paths_and_lists_tuples() -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "value", "held"),
+    [
+        ("number", 2, "2.0"),
+        ("count", 2, "2"),
+        ("sides", np.array([1, 2]), "(1.0, 2.0)"),
+        ("lines", [[0, 1]], "((0.0, 1.0),)"),
+        ("switch", True, "True"),
+    ],
+)
+def test_whole_numbers_are_floats_where_the_type_says_so(name: str, value: Any, held: str) -> None:
+    assert repr(getattr(_Options(**{name: value}), name)) == held
+
+
+@pytest.mark.parametrize(
     ("name", "value", "expected"),
     [
         ("number", 0.0, "a number above 0 and of at most 10"),
@@ -78,6 +92,12 @@ def test_options_within_options_are_of_their_class() -> None:
             StitchOptions(**{name: 3})  # type: ignore[arg-type]
     with pytest.raises(ArgumentError, match="distortion must be"):
         TileOptions(distortion=3.0)
+
+
+def test_the_compositor_has_its_own_number_of_threads_where_it_is_given() -> None:
+    composite = CompositeOptions(workers=1)
+    assert StitchOptions(workers=2, composite=composite).compositing.workers == 1
+    assert StitchOptions(workers=2).compositing.workers == 2
 
 
 def test_the_class_says_what_its_options_are() -> None:
@@ -122,6 +142,7 @@ def test_arrays_become_tuples_of_numbers() -> None:
     [
         ({"max_size": 1200, "crop": "auto"}, {"extent": (0, 0, 1, 1)}, {"max_size": None, "crop": "none"}),
         ({"max_size": 1200}, {"scale": 1.0}, {"max_size": None}),
+        ({"max_size": 1200}, {"gsd": None}, {}),
         ({"max_size": 1200, "scale": 0.5}, {"scale": 2.0, "max_size": 9}, {}),
         ({"scale": 0.5, "rotate": 9.0}, {"like": "a.tif"}, {"scale": 1.0, "rotate": 0.0}),
         ({"like": "a.tif", "extent": (0, 0, 1, 1)}, {"gsd": 0.1}, {"like": None, "extent": None}),
@@ -149,6 +170,8 @@ def test_what_contradicts_or_is_unknown_is_refused() -> None:
     for recipe, inputs in ((rdstitch.apply, ("none.json", "none")), (rdstitch.tiles, ("none",))):
         with pytest.raises(ArgumentError, match="no option 'overwite'; do you mean 'overwrite'"):
             recipe(*inputs, overwite=True)
+    with pytest.raises(ArgumentError, match="no option 'scal'; do you mean 'scale'"):
+        rdstitch.apply("none.json", ["none"], scal=0.5)
     for wrong in ({"layout": "kiti"}, {"height": 0}, {"frame": "map"}):
         with pytest.raises(ArgumentError, match=f"{next(iter(wrong))} must be"):
             rdstitch.trajectory("none", **wrong)
@@ -188,8 +211,9 @@ def test_what_is_of_another_kind_is_refused_by_name() -> None:
     with pytest.raises(ArgumentError, match="poses must be FollowedPoses, not"):
         rdstitch.Tracker(poses=options)
     images: Any = [np.zeros((40, 30), np.uint8)] * 2
-    with pytest.raises(ArgumentError, match="image must be one image, not 2"):
-        rdstitch.Tracker().add(images)
+    for count in (2, 0):
+        with pytest.raises(ArgumentError, match=f"image must be one image, not {count}"):
+            rdstitch.Tracker().add(images[:count])
 
 
 @pytest.mark.parametrize("wrong", [{"height": -2.0}, {"frame": "enuu"}])

@@ -19,6 +19,7 @@ from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.bands import mosaic_bands
+from rdstitch.pipeline.output_plan import file_of_part
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.sidecar.read import mismatch_with_image, read_sidecar
 from tests.cli.running import flight, sidecar_of
@@ -123,6 +124,31 @@ def test_all_bands_of_a_rig_at_once(rig: Path, tmp_path: Path) -> None:
     cogeo = pytest.importorskip("rio_cogeo.cogeo")
     for file in ("f.tif", "f-RED.tif", "f-NIR.tif"):
         assert cogeo.cog_validate(tmp_path / file, quiet=True) == (True, [], [])
+
+
+def test_bands_of_an_ome_tiff_are_ome_tiffs(rig: Path, tmp_path: Path) -> None:
+    options = StitchOptions(workers=1, positions=rig / "p.csv")
+    bands = {"RED": "*_red.png", "NIR": "*_NIR.png"}
+    mosaic_bands([rig / "red", rig / "nir"], tmp_path / "f.ome.tif", bands, options)
+    pages = {}
+    for name in ("f.ome.tif", "f-RED.ome.tif", "f-NIR.ome.tif"):
+        with tifffile.TiffFile(tmp_path / name) as tiff:
+            assert tiff.is_ome
+            pages[name] = tiff.series[0].asarray()
+    stack = np.moveaxis(pages["f.ome.tif"], 0, -1)
+    np.testing.assert_array_equal(stack[..., :3], pages["f-RED.ome.tif"])
+    np.testing.assert_array_equal(stack[..., 3], pages["f-NIR.ome.tif"])
+    for file in (rig / "nir").iterdir():
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        several = np.stack([image] * 5, axis=-1)
+        tifffile.imwrite(tmp_path / f"{file.stem}.tif", several, photometric="minisblack", planarconfig="contig")
+    with pytest.raises(ArgumentError, match="images of NIR are neither grey nor RGB"):
+        mosaic_bands([rig / "red", tmp_path], tmp_path / "g.ome.tif", {"RED": "*_red.png", "NIR": "*_NIR.tif"}, options)
+
+
+@pytest.mark.parametrize("name", ["f-2.tif", "f-2.ome.tif", "f-2.OME.TIFF", "a.b-2.png", "f-2.ome.zarr"])
+def test_the_file_of_a_part_has_the_same_format(name: str) -> None:
+    assert file_of_part(Path(name.replace("-2", "")), 2) == Path(name)
 
 
 def _write_shifted(rig: Path, folder: Path) -> None:

@@ -120,6 +120,10 @@ def test_tiles_of_several_sizes_lie_where_they_are(tmp_path: Path) -> None:
     x, y = np.rint(places[4] - places.min(axis=0)).astype(int) + 80
     near = [mosaic[y + v : y + v + 60, x + u : x + u + 60] for v in (-1, 0, 1) for u in (-1, 0, 1)]
     assert any(np.array_equal(part, TILES[4][80:140, 80:140]) for part in near)
+    _, registration = rdstitch.place_tiles(tmp_path, positions=tmp_path / "positions.csv", distortion=0.0)
+    assert registration.summary.endswith("λ = 0.0000 (given)")
+    with pytest.raises(ArgumentError, match="neither a flat field nor a lens in common"):
+        rdstitch.place_tiles(tmp_path, positions=tmp_path / "positions.csv", distortion=0.01)
     with pytest.raises(ArgumentError, match="tiles of different sizes do not show λ"):
         rdstitch.tiles(tmp_path, positions=tmp_path / "positions.csv", distortion="auto")
 
