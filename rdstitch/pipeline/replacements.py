@@ -10,9 +10,9 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.options.apply_options import ApplyOptions
+from rdstitch.pipeline.counterparts import counterparts
 from rdstitch.pipeline.flat_field import check_one_size, with_flat_field
 from rdstitch.results.messages import Message, left_out, merge_by_reason
-from rdstitch.sidecar.counterparts import counterparts
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.records import MatchedBy
 from rdstitch.stage.tile_inputs import tile_frames
