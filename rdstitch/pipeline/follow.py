@@ -239,7 +239,7 @@ class Tracker:
         return tuple(self._poses_of(self._frames.finish()))
 
     def _poses_of(self, results: Sequence[TrackingResult]) -> list[Pose]:
-        poses = [replace(self._labels[result.number], tracked=result, reason=result.reason) for result in results]
+        poses = [replace(self._labels[result.number], tracked=result) for result in results]
         if poses:
             poses[-1] = replace(poses[-1], messages=self.messages[self._reported :])
             self._reported = len(self.messages)

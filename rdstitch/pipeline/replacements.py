@@ -11,8 +11,8 @@ from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.pipeline.composition.flat_field import check_one_size, with_flat_field
+from rdstitch.pipeline.counterparts import counterparts
 from rdstitch.results.messages import Message, left_out, merge_by_reason
-from rdstitch.sidecar.counterparts import counterparts
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.records import MatchedBy
 from rdstitch.stage.tile_inputs import tile_frames

@@ -40,8 +40,8 @@ class Pose:
         s; NaN where not known.
     tracked : TrackingResult
         Its place and λ, as far as they are known.
-    reason : str
-        Why there is no place; empty where there is one.
+    problem : str
+        Why the frame was not tracked at all; empty where it was.
     poses : FollowedPoses
         How the pose is printed.
     messages : tuple of Message
@@ -52,12 +52,17 @@ class Pose:
     number: int
     timestamp: float
     tracked: TrackingResult = field(default_factory=TrackingResult)
-    reason: str = ""
+    problem: str = ""
     poses: FollowedPoses = FollowedPoses()
     messages: tuple[Message, ...] = ()
 
     def __bool__(self) -> bool:
         return self.tracked.pose is not None
+
+    @property
+    def reason(self) -> str:
+        """Why there is no place; empty where there is one."""
+        return self.problem or self.tracked.reason
 
     @property
     def unit(self) -> float:

@@ -29,7 +29,8 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import Frame
 from rdstitch.robust import EstimationOptions
 from rdstitch.synthetic import RenderedSequence, ground, sequence_over
-from rdstitch.tracking import FrameTracker
+from rdstitch.tracking import FrameTracker, TrackingResult
+from rdstitch.tracking.tracking_state import TrackingState
 
 HEIGHT = 0.8
 
@@ -65,6 +66,11 @@ def test_what_cannot_be_read_is_a_pose_without_a_place(tmp_path: Path) -> None:
     pose = _tracker().add(tmp_path / "broken.png")
     assert "not an image in a supported format" in pose.reason
     assert not pose
+
+
+def test_the_reason_is_that_of_the_tracking() -> None:
+    tracked = TrackingResult(state=TrackingState.NO_TEXTURE)
+    assert rdstitch.Pose("a.jpg", 1, 0.0, tracked).reason == "no floor texture"
 
 
 @pytest.mark.parametrize(
