@@ -119,7 +119,8 @@ def apply_to_images(saved: SavedRegistration, images: FoundImages, run: Run, opt
     """Compose images that were found by a saved registration, into memory or among the outputs."""
     output = run.output
     given = read_replacements(saved, images.frames, options, run.guard, run.options.composite.max_memory)
-    OutputPlan.of_images(run, ()).check_places(list(given.sources.values()))
+    placed = saved.record.output.place is not None
+    OutputPlan.of_images(run, ()).check_places(list(given.sources.values()), placed=placed)
     lens, of_lens = _lens_of_band(saved, given.sources, run.progress)
     plan, of_turn = _laid_out(saved, given.sources, lens, run.options.composite)
     composed, of_output = compose_images(plan, run)

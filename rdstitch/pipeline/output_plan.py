@@ -99,10 +99,13 @@ class OutputPlan:
         check_outputs([*of_images, *self.files, *beside], outputs.overwrite, self.read)
         check_not_read([] if self.replaced_bag is None else [self.replaced_bag], self.read)
 
-    def check_places(self, sources: Sequence[Source]) -> None:
-        """The same of files that place images on the Earth, once it is known whether there will be any."""
+    def check_places(self, sources: Sequence[Source], *, placed: bool = False) -> None:
+        """The same of files that place images on the Earth, once it is known whether there will be any.
+
+        By the positions of the images, or where they are ``placed`` by an earlier output.
+        """
         run = self.run
-        if run.options.composite.georeference != "off" and has_place(sources):
+        if run.options.composite.georeference != "off" and (placed or has_place(sources)):
             files = [file for image in self.images for file in world_file_paths(image)]
             check_outputs(files, run.outputs.overwrite)
         elif run.beside.has_poses_on_map:

@@ -139,7 +139,7 @@ def compose_images(
             *lost_profile_messages(placed.sources[0], Path(output)),
             *differing_profile_messages(placed.sources),
         ]
-        if place is not None and (files := world_file_paths(output) if placed.has_place else ()):
+        if place is not None and (files := world_file_paths(output)):
             messages += outputs.attempt(files[0], partial(_write_world_files, outputs, files, place))
     return replace(composed, canvas=made.canvas, georeference=place, seams=plan.seams), messages
 

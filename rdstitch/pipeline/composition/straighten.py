@@ -72,7 +72,9 @@ def reoriented(
     if placed.orientation is not None:
         homographies = np.linalg.inv(placed.orientation) @ placed.homographies
         placed = replace(placed, homographies=homographies, orientation=None, place=None)
-    return oriented(placed, options)
+    turned, messages = oriented(placed, options)
+    # Another plane has another place on the Earth.
+    return turned if turned.orientation is None else replace(turned, place=None), messages
 
 
 def view_rotation(options: UprightOptions) -> FloatArray | None:

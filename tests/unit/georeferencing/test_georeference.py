@@ -153,6 +153,11 @@ def test_bands_lie_like_the_first(
         with Image.open(path) as image:
             image.save(tmp_path / "band" / path.name)
     apply(tmp_path / "a.tif.json", [tmp_path / "band"], tmp_path / "b.tif", workers=1)
+    apply(tmp_path / "a.tif.json", [tmp_path / "band"], tmp_path / "d.png", workers=1)
+    assert "UTM_Zone_34S" in (tmp_path / "d.prj").read_text(encoding="ascii")
+    (tmp_path / "e.pgw").write_text("mine", encoding="ascii")
+    with pytest.raises(OutputError, match=r"e\.pgw: exists already"):
+        apply(tmp_path / "a.tif.json", [tmp_path / "band"], tmp_path / "e.png", workers=1)
     coarse = CompositeOptions(gsd=0.5)
     apply(tmp_path / "a.tif.json", paths, tmp_path / "c.tif", replace(coarse, epsg=2048), workers=1)
     with rasterio.open(tmp_path / "c.tif") as other:
@@ -160,6 +165,19 @@ def test_bands_lie_like_the_first(
     with rasterio.open(tmp_path / "a.tif") as one, rasterio.open(tmp_path / "b.tif") as two:
         assert (one.crs, one.shape) == (two.crs, two.shape)
         np.testing.assert_allclose(one.transform, two.transform, atol=1e-6)
+
+
+def test_another_plane_has_another_place(
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
+) -> None:
+    options, stitch = CompositeOptions(scale=0.3), replace(cached, reference=located[0][0].name)
+    mosaic(located[0], tmp_path / "a.tif", replace(stitch, composite=options))
+    options = replace(options, rectangle=(60.0, 60.0, 300.0, 40.0, 310.0, 240.0, 50.0, 220.0))
+    expected = mosaic(located[0], options=replace(stitch, composite=options)).georeference
+    found = apply(tmp_path / "a.tif.json", located[0], None, options, workers=1).georeference
+    assert found is not None
+    assert expected is not None
+    np.testing.assert_allclose(found.pixel_to_map, expected.pixel_to_map, atol=0.02)
 
 
 def test_others_get_a_world_file(located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path) -> None:
