@@ -179,9 +179,9 @@ class Tracker:
             False, with the reason, where the frame has no place, or not yet: those of the first frames come later, in
             :attr:`revised`.
         """
-        time = None if timestamp is None else _measured("timestamp", timestamp)[0]
-        tilt = None if attitude is None else _measured("attitude", attitude, 2)
-        wheels = (math.nan,) if odometry is None else _measured("odometry", odometry, 3)
+        time = None if timestamp is None else _as_numbers("timestamp", timestamp)[0]
+        tilt = None if attitude is None else _as_numbers("attitude", attitude, 2)
+        wheels = (math.nan,) if odometry is None else _as_numbers("odometry", odometry, 3)
         body = BodyPose(*wheels) if all(map(math.isfinite, wheels)) else None
         number = next(self._numbers)
         inputs = as_inputs(image, self._options.channel_order)
@@ -206,14 +206,14 @@ class Tracker:
         try:
             if attitude is not None:
                 source = replace(source, attitude=_tilt(*attitude))
-            (source,) = self._measured(source)
+            (source,) = self._with_measurements(source)
             view = source.view(megapixels)
             image = prepare(view, megapixels, stretch=features.stretch, equalize=bool(features.equalize))
             return ReadFrame(frame, source, image)
         except InputError as error:
             return ReadFrame(frame, source, problem=str(error))
 
-    def _measured(self, source: Source) -> list[Source]:
+    def _with_measurements(self, source: Source) -> list[Source]:
         """The frame with its mask and attitude."""
         options = self._options
         (source,) = with_masks([source], options.mask, all_known=False)
@@ -248,7 +248,7 @@ class Tracker:
         return poses
 
 
-def _measured(name: str, value: ArrayLike, *shape: int) -> list[float]:
+def _as_numbers(name: str, value: ArrayLike, *shape: int) -> list[float]:
     """The numbers that came with a frame, NaN where a sensor has none."""
     try:
         # Dates would be numbers, but of days or nanoseconds.

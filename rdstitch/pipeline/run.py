@@ -71,19 +71,18 @@ class Run:
         if purpose.poses:
             options = with_odometry_of_bag(given, options)
         known, notes = with_camera(options, given, of_bag=purpose is not Purpose.CALIBRATE)
-        guard, outputs = InputGuard(options.strict), Outputs(options.overwrite)
         return cls(
-            known,
-            file,
-            beside,
-            purpose,
-            given,
-            every,
-            options.files,
-            notes,
-            StageTimer(progress),
-            guard,
-            outputs=outputs,
+            options=known,
+            output=file,
+            beside=beside,
+            purpose=purpose,
+            inputs=given,
+            every=every,
+            read=options.files,
+            notes=notes,
+            progress=StageTimer(progress),
+            guard=InputGuard(options.strict),
+            outputs=Outputs(options.overwrite),
         )
 
     @contextmanager
