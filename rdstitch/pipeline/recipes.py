@@ -22,6 +22,7 @@ from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside, ReportFil
 from rdstitch.options.option import check_parameter, options_of
 from rdstitch.options.shared_options import Height
 from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.pipeline.camera_path import camera_path
 from rdstitch.pipeline.composition.choose_layout import choose_layout
 from rdstitch.pipeline.composition.compose import compose_images
 from rdstitch.pipeline.composition.lay_out import CandidateLayout
@@ -29,7 +30,6 @@ from rdstitch.pipeline.composition.map_canvas import check_map
 from rdstitch.pipeline.output_plan import OutputPlan, report_refused, save_camera, stage_report
 from rdstitch.pipeline.read_inputs import in_order, read_inputs
 from rdstitch.pipeline.registration.accept import accept
-from rdstitch.pipeline.registration.camera_path import camera_path
 from rdstitch.pipeline.registration.realign import aligner_of, with_reference_of
 from rdstitch.pipeline.registration.register import register
 from rdstitch.pipeline.registration.working_size import at_full_size

@@ -19,8 +19,8 @@ from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.option import check_parameter, options_of
 from rdstitch.options.shared_options import Every
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.registration.camera_path import with_odometry_of_bag
-from rdstitch.pipeline.registration.given_camera import with_camera
+from rdstitch.pipeline.camera_path import with_odometry_of_bag
+from rdstitch.pipeline.given_camera import with_camera
 from rdstitch.results.messages import Message
 from rdstitch.system.outputs import Outputs
 from rdstitch.system.progress import Progress, StageTimer, silent

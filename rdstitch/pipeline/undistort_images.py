@@ -20,7 +20,7 @@ from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.write import write_image
 from rdstitch.options.option import check_parameter, files_in
-from rdstitch.pipeline.registration.given_camera import read_camera
+from rdstitch.pipeline.given_camera import read_camera
 from rdstitch.results.messages import Message, ignored
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.output_checks import WRITABLE_SUFFIXES, check_outputs

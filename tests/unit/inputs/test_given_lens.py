@@ -13,8 +13,8 @@ from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.inputs.source import read_sources
 from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.pipeline.given_camera import with_camera
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.pipeline.registration.given_camera import with_camera
 
 K, D = [214.0, 0.0, 156.8, 0.0, 216.0, 122.6, 0.0, 0.0, 1.0], [-0.29, 0.09, -0.0009, 0.0008, -0.0135]
 EQUIDISTANT = [-0.01, 0.03, -0.02, 0.004]
