@@ -83,10 +83,10 @@ def mosaic_bands(
         first = stitch_images(of_first, run, more_images=files[1:], more_files=stack)
         saved = replace(read_sidecar(outputs.where(f"{files[0]}.json")), path=Path(f"{files[0]}.json"))
         same = ApplyOptions(mask=options.mask, channel_order=options.channel_order, **options.of_run)
-        of_band = replace(apply_run(saved, None, saved.composite, same, progress), outputs=outputs)
+        runs = (replace(apply_run(saved, name, saved.composite, same, progress), outputs=outputs) for name in files[1:])
         others = tuple(
-            apply_to_images(saved, FoundImages(band, []), replace(of_band, output=name), same)
-            for band, name in zip(chosen[1:], files[1:], strict=True)
+            apply_to_images(saved, FoundImages(band, []), of_band, same)
+            for band, of_band in zip(chosen[1:], runs, strict=True)
         )
         if stack:
             _stage_stack(file, dict(zip(bands, files, strict=True)), first, outputs)

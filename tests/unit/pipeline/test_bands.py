@@ -126,6 +126,19 @@ def test_all_bands_of_a_rig_at_once(rig: Path, tmp_path: Path) -> None:
         assert cogeo.cog_validate(tmp_path / file, quiet=True) == (True, [], [])
 
 
+def test_what_is_damaged_in_one_band_is_said_of_that_band_alone(rig: Path, tmp_path: Path) -> None:
+    for k, name in enumerate(_NAMES):
+        frame = cv2.imread(str(rig / "nir" / name.format("NIR")))
+        assert frame is not None
+        coded = cv2.imencode(".jpg", frame)[1].tobytes()
+        (tmp_path / f"{name.format('NIR')[:-4]}.jpg").write_bytes(coded.replace(coded[-300:-260], bytes(40)) if k == 1 else coded)
+        cv2.imwrite(str(tmp_path / name.format("RE")), frame)
+    bands = {"RED": "*_red.png", "NIR": "*_NIR.jpg", "RE": "*_RE.png"}
+    _, (nir, edge) = mosaic_bands([rig / "red", tmp_path], tmp_path / "f.tif", bands, StitchOptions(workers=1))
+    damaged = [[m for m in each.messages if m.code == "damaged"] for each in (nir, edge)]
+    assert [len(each) for each in damaged] == [1, 0]
+
+
 def test_bands_of_an_ome_tiff_are_ome_tiffs(rig: Path, tmp_path: Path) -> None:
     options = StitchOptions(workers=1, positions=rig / "p.csv")
     bands = {"RED": "*_red.png", "NIR": "*_NIR.png"}
