@@ -92,11 +92,11 @@ class ReliefField:
         o, errors = self.response.adjuster.observations, self._errors
         products = np.einsum("mi,mi->m", errors[first], errors[second])
         off, power = products - products.mean(), float((errors[np.unique(self._pairs)] ** 2).mean())
-        mean = float(products.mean()) - power * self._response_to(_independent, _NOISE_FIELDS)[0]
+        excess = float(products.mean()) - power * self._response_to(_independent, _NOISE_FIELDS)[0]
         # Errors of a link depend on each other; of one link alone that does not show.
         variance = max((np.bincount(o.link[first], off, len(o)) ** 2).sum(), (off**2).sum()) / len(first) ** 2
         # Less what chance makes of it: the positive part of James and Stein's estimate.
-        return max(mean - float(variance) / mean, 0.0) if mean > 0.0 else 0.0
+        return max(excess - float(variance) / excess, 0.0) if excess > 0.0 else 0.0
 
     @cached_property
     def _errors(self) -> FloatArray:

@@ -69,14 +69,12 @@ def map_contradicted(places: str, distance: float | None, growth: float) -> Mess
 
 def relief_explained(left: Coherence, model: MotionModel, links: int) -> str:
     """What the agreement of neighbours that a model leaves means for the scene."""
-    significant = shows_relief(left)
+    relief = shows_relief(left)
     agreement = f"errors of neighbours agree (correlation {left.correlation:.2f}, {left.size:.1f} pixels in common)"
     if model.on_sphere:
         moved = "the camera moved between the images (parallax): what is near does not fit; turn about the lens"
-        return (
-            f"{agreement}: {moved}" if significant else f"the camera hardly moved (correlation {left.correlation:.2f})"
-        )
-    if significant:
+        return f"{agreement}: {moved}" if relief else f"the camera hardly moved (correlation {left.correlation:.2f})"
+    if relief:
         wrong = f"the scene is not one plane, or the {model.name} model does not describe the camera; λ may be off"
         return f"{agreement}: {wrong}"
     if left.correlation > COHERENT_CORRELATION:

@@ -102,8 +102,8 @@ def read_polynomial(
 def hugin_lens(camera: Camera) -> tuple[dict[str, float], LensFit]:
     """The size and lens of an image line by Hugin's names, and how far that is from the lens."""
     width, height = camera.image_size
-    (lens, fit), powers = fitted_polynomial(camera, _HUGIN), _HUGIN
-    scale, (a, b, c) = kept_at_unit(terms_in(lens, min(camera.image_size) / 2, powers), powers)
+    lens, fit = fitted_polynomial(camera, _HUGIN)
+    scale, (a, b, c) = kept_at_unit(terms_in(lens, min(width, height) / 2, _HUGIN), _HUGIN)
     half_width, fisheye = width / 2 / (lens.mean_focal * scale), lens.kind != "polynomial"
     view = 2.0 * math.degrees(half_width if fisheye else math.atan(half_width))
     projection = _FISHEYE if fisheye else _RECTILINEAR

@@ -23,7 +23,7 @@ _OPAQUE_FROM = 128  # alpha
 _NEGLIGIBLE_SHRINK = 1.05  # an image that gets smaller by less than this keeps its pixels as they are
 # Pixels read for one of the output, at least: a Gaussian needs nearly two to smooth them.
 _PIXELS_PER_OUTPUT_PIXEL = 1.9
-_SMALLEST = 8  # largest reduction at which images are read
+_PROBE_REDUCTION = 8  # at which an image is read only to learn its samples and whether it is masked
 
 ImageLoader = Callable[[int], DecodedImage]
 """Reads an image reduced by a factor, of which large ones are quicker; see :func:`rdstitch.io.read_image`."""
@@ -205,14 +205,14 @@ class ImageReader:
     def masked(self, index: int) -> bool:
         """Whether an image has transparent parts; reads it when that is not known yet."""
         if index not in self._masked:
-            self(index, _SMALLEST)
+            self(index, _PROBE_REDUCTION)
         return self._masked[index]
 
     @property
     def samples(self) -> tuple[int, np.dtype[Any]]:
         """Number of channels and type of all images' samples; reads the first one when none has been read."""
         if self._samples is None:
-            self(0, _SMALLEST)
+            self(0, _PROBE_REDUCTION)
         assert self._samples is not None
         channels, dtype, _ = self._samples
         return (channels[0] if channels else 1), dtype

@@ -29,7 +29,7 @@ _ONE_THREAD = (
     "OPENCV_FOR_THREADS_NUM",
 )
 _ATTEMPTS = 2  # at a task whose worker died
-_LENGTH = 8  # bytes, of the length of a pickle
+_LENGTH_BYTES = 8  # of the field that holds the length of a pickle
 
 
 class ProcessExecutor(Executor):
@@ -145,14 +145,14 @@ def _queue_tasks(stream: IO[bytes], tasks: "SimpleQueue[bytes]") -> None:
 
 def _send(stream: IO[bytes], pickled: bytes) -> None:
     """Write a pickle after its length: one that cannot be loaded leaves nothing behind for the next."""
-    stream.write(len(pickled).to_bytes(_LENGTH, "big"))
+    stream.write(len(pickled).to_bytes(_LENGTH_BYTES, "big"))
     stream.write(pickled)
     stream.flush()
 
 
 def _receive(stream: IO[bytes]) -> bytes:
     """Read a pickle after its length; EOFError where the other side is gone."""
-    length = int.from_bytes(_exactly(stream, _LENGTH), "big")
+    length = int.from_bytes(_exactly(stream, _LENGTH_BYTES), "big")
     return _exactly(stream, length)
 
 

@@ -117,7 +117,7 @@ class Camera:
     focal : float or None
         Focal length, pixels, or None where nothing is known of it.
     focal_source : FocalSource or None
-        Where the focal length comes from; None where it is guessed or not known.
+        Where the focal length comes from, a key of :data:`FOCAL_LOG_STD`; None counts as "guess".
     focal_std : float or None
         Standard deviation of an estimated focal length, pixels; None where :data:`FOCAL_LOG_STD` stands for it.
     tilt, tilt_std : (float, float) or None

@@ -76,7 +76,7 @@ class Georeference:
 
     @property
     def rejected(self) -> tuple[Residual, ...]:
-        """Of the positions that were not used."""
+        """Residuals of the positions that were not used."""
         return tuple(residual for residual in self.residuals if not residual.used)
 
     @property

@@ -97,7 +97,7 @@ def _named_by(argument: Named, lists: tuple[Path, ...]) -> Expanded:
             if file in lists:
                 raise InputError(f"{file}: the list of images names itself")
             # Another program may write the list while we read it: @<(find ...) in a shell.
-            inner = expanded(names_in(read_text(file, regular=False)), (*lists, file))
+            inner = expanded(names_in(read_text(text[1:], regular=False)), (*lists, file))
             return replace(inner, containers=[file, *inner.containers])
         return Expanded.several(_matching(text)) if glob.has_magic(text) else Expanded([ListedImage(Frame(path))])
     if is_bag(path):

@@ -78,12 +78,11 @@ class _AttitudesByName:
 
     def of(self, sources: Sequence[Source]) -> list[MeasuredTilt]:
         """Tilts of images, each of which the table must name."""
-        tilts = []
-        for source, row in zip(sources, self.rows.of(sources), strict=True):
-            if row is None:
-                raise InputError(f"{self.file}: has no line for {source.name}; add one with its psi and theta")
-            tilts.append(MeasuredTilt(turned_tilt(_tilt_of(row), turning_matrix(source.metadata.orientation))))
-        return tilts
+        rows = self.rows.needed(sources, self.file, "psi and theta")
+        return [
+            MeasuredTilt(turned_tilt(_tilt_of(row), turning_matrix(source.metadata.orientation)))
+            for source, row in zip(sources, rows, strict=True)
+        ]
 
 
 @dataclass(frozen=True, eq=False)

@@ -90,3 +90,12 @@ class RowsByImage:
             if len(rows) > 1:
                 raise InputError(f"{rows[1].where}: {rows[1].image} is here twice; remove one, or write their folders")
         return [best[index][1][0] if index in best else None for index in range(len(images))]
+
+    def needed(self, images: Sequence[NamedFile], file: str | Path, wanted: str) -> list[Row]:
+        """The row of each image; an error asks for what is ``wanted`` of one that has none in the file."""
+        rows = []
+        for image, row in zip(images, self.of(images), strict=True):
+            if row is None:
+                raise InputError(f"{file}: has no line for {image.name}; add one with its {wanted}")
+            rows.append(row)
+        return rows

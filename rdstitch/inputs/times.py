@@ -86,12 +86,7 @@ class _TimesByName:
 
     def of(self, frames: Sequence[Frame]) -> list[float]:
         """Times of images, each of which the file must name."""
-        times = []
-        for frame, row in zip(frames, self.rows.of(frames), strict=True):
-            if row is None:
-                raise InputError(f"{self.file}: has no time for {frame.name}; add a line with its name and time")
-            times.append(row.needed("timestamp"))
-        return times
+        return [row.needed("timestamp") for row in self.rows.needed(frames, self.file, "time")]
 
     def of_one(self, frame: Frame) -> float | None:
         """Time of a frame by its name."""

@@ -1,4 +1,4 @@
-"""What an image's files come to, by which a sidecar knows its image again."""
+"""Size and digest of an image's files, by which a sidecar recognises its image."""
 
 import hashlib
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Fingerprint:
-    """What an image's files come to."""
+    """Size and digest of an image's files."""
 
     size: int  # bytes of all files
     # of the file; of a Deep Zoom image that of the list of its files, as ``sha256sum`` prints it (digest, two spaces,

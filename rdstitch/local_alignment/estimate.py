@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray, evenly_spaced
+from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.local_alignment.field import DisplacementField
@@ -112,7 +112,7 @@ def align_locally(
     straight = cache(lambda: _long_edges(edges, cameras))
     base = ground = None
     if centers is not None:
-        base, ground = _rough_ground(placed, held_out, images, centers, cells, straight, worthwhile)
+        base, ground = _rough_ground(placed, fitted, tested, images, centers, cells, straight, worthwhile)
     if ground is not None:
         limit = math.inf
     candidates = list(_candidates(fitted, tested, images, min(coarse, cells), cells, base))
@@ -136,7 +136,8 @@ def align_locally(
 
 def _rough_ground(
     placed: PlacedMatches,
-    held_out: BoolArray,
+    fitted: PlacedMatches,
+    tested: PlacedMatches,
     images: ImagesOnSurface,
     centers: FloatArray,
     cells: int,
@@ -144,7 +145,6 @@ def _rough_ground(
     worthwhile: float,
 ) -> tuple[PlacedFields, PlacedFields] | tuple[None, None]:
     """The freest worthwhile heights of the ground, by matches not held out and by all; None where none are."""
-    fitted, tested = placed.take(~held_out), placed.take(held_out)
     for slope in _SLOPES_OF_GROUND:
         part = _ground(fitted, images, centers, Stiffness(cells, slope))
         cost = _seam_residual(tested.residual_with(part.delivered, images))

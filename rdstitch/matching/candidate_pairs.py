@@ -86,7 +86,7 @@ def _nearest_pairs(places: FloatArray, images: IntArray, most: int) -> set[Pair]
 
 
 def select_pairs(shared: Mapping[Pair, StoredMatches], cameras: Sequence[Camera]) -> dict[Pair, StoredMatches]:
-    """Select of the pairs that share something those that one of their images needs for its place.
+    """Select those pairs that one of their images needs for its place, of pairs that share something.
 
     An image takes one partner after the other: the one whose matches add most to the sum of the square roots of the
     numbers of matches in its cells. So partners with many matches come first, but rather around the image than

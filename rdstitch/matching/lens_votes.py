@@ -23,7 +23,7 @@ _MIN_STD = 2e-4  # λ; no pair knows it better than that the division model hold
 _MIN_INLIERS = 30  # of a pair that votes: three times the parameters of a homography and two λ
 _COMMON_STD = 0.05  # λ; by so much relief and lenses of another kind change what a pair sees, of both images alike
 _MAX_COHERENCE = 0.5  # correlation of neighbours' errors: more is depth, for which λ of either image takes the blame
-_REWEIGHTINGS = 6  # rounds of the median
+_REWEIGHTINGS = 6  # rounds of reweighting, which lead to the median
 _LEAST_RESIDUAL = 0.1  # standard deviations below which all votes count alike
 _PAIRS_AT_ONCE = 64
 

@@ -21,11 +21,11 @@ from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.system.late_imports import spatial
 
 _MIN_IMAGES = 3  # images that pairs which move must connect: two could agree by chance
-_MIN_STATIC = 0.5  # the same as a fraction of all images
+_MIN_CONNECTED = 0.5  # the same as a fraction of all images
 _MAX_STATIC_MOTION = 1.0 / 3.0
 """Motion of a static match at most, in thresholds: its two keypoints are localised to better than that."""
 
-_MIN_STATIC_MATCHES = 8
+_MIN_CONNECTED_MATCHES = 8
 """Of a pair that moves. Wrong matches lie anywhere: of 1,000, less than one ends within a pixel of where it began."""
 
 _MIN_CONFIRMATIONS = 3  # static matches at one place, from which on every feature there counts as static
@@ -50,7 +50,7 @@ class _Motion:
         moved = np.linalg.norm(matches.points2 - matches.points1, axis=1)
         static = bool(pair.relation) and float(np.median(moved[inliers])) < radius
         overlay = (moved < radius) & ~inliers
-        overlaid = bool(pair.relation) and not static and int(overlay.sum()) >= _MIN_STATIC_MATCHES
+        overlaid = bool(pair.relation) and not static and int(overlay.sum()) >= _MIN_CONNECTED_MATCHES
         return cls(matches, moved, static, overlay & overlaid)
 
 
@@ -126,4 +126,4 @@ def show_motion(pairs: Sequence[PairRegistration], count: int, threshold: float)
     """Whether pairs that do move connect a good part of the ``count`` images, so that this is no chance."""
     linked = [pair for pair in pairs if pair.relation and not is_static_pair(pair, threshold)]
     connected = connected_components(count, [pair.image1 for pair in linked], [pair.image2 for pair in linked])[0]
-    return len(connected) >= max(_MIN_IMAGES, _MIN_STATIC * count)
+    return len(connected) >= max(_MIN_IMAGES, _MIN_CONNECTED * count)

@@ -20,7 +20,7 @@ def nearest_points(points: FloatArray, queries: FloatArray, count: int) -> tuple
     smaller of ``count`` and N.
     """
     if not (np.isfinite(points).all() and np.isfinite(queries).all()):
-        raise ValueError("points are not finite")  # OpenCV would give indices of none
+        raise ValueError("points are not finite")  # OpenCV would give indices of no point
     if not len(points) or not len(queries):
         shape = len(queries), min(count, len(points))
         return np.zeros(shape), np.zeros(shape, dtype=np.intp)

@@ -48,7 +48,7 @@ class CanvasOptions(UprightOptions):
     rotate: float = option(0.0, "Turn the output clockwise, degrees; north is then not turned up.", "DEG")
     north_up: bool = option(
         True,
-        "Turn north up where three images or more have a GPS position that fits, or not; north up by default.",
+        "Turn north up where three images or more have a GPS position that fits (the default), or never.",
         flag="--north-up/--no-north-up",
     )
     gsd: float | None = option(

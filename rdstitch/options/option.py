@@ -31,7 +31,7 @@ class FileUse(Enum):
 
 
 class Unit(StrEnum):
-    """Of numbers that are entered in another way on the command line: as degrees, and as 800M."""
+    """Units of numbers that the command line takes in another form: angles in degrees, bytes as 800M."""
 
     RADIANS = auto()
     DEGREES = auto()

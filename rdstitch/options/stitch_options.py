@@ -92,7 +92,7 @@ class StitchOptions(RansacOptions, RunOptions):
     positions_offset: float = option(0.0, "Seconds from the times of the images to those of the GPX track (UTC).", "S")
     position_accuracy: float | None = option(
         None,
-        "Standard deviation of a horizontal coordinate of positions that tell none, metres.",
+        "Standard deviation of a horizontal coordinate of positions that state none, metres.",
         "M",
         within=Range(above=0.0),
     )

@@ -56,6 +56,7 @@ class Examination:
     blurred: tuple[str, ...]
     """Names of images that are much less sharp than the others."""
     dark: tuple[str, ...]
+    """Names of images that are dark."""
     burnt: tuple[str, ...]
     """Names of images that are burnt out."""
     alone: tuple[str, ...]

@@ -135,8 +135,8 @@ class Tracker:
                 check_readable(Path(file))
         # Of frames that have been made ready.
         features = replace(self._detection, work_megapixels=None, stretch=None, equalize=False)
-        in_process = (self._options.threads > 1 or not patient) and bool(sys.executable)
-        executor = ProcessExecutor(1) if in_process else ThreadPoolExecutor(1)
+        in_subprocess = (self._options.threads > 1 or not patient) and bool(sys.executable)
+        executor = ProcessExecutor(1) if in_subprocess else ThreadPoolExecutor(1)
         weakref.finalize(self, executor.shutdown, wait=False, cancel_futures=True)
         matcher = partial(match, ratio=self._options.ratio)
         known = self._options.estimation, alignment_options([], self._options)

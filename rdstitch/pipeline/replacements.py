@@ -1,4 +1,4 @@
-"""Which of the given images take the places of registered ones: read, corrected, and with the cameras found then."""
+"""Which of the given images take the places of registered ones: read, corrected, and with the registered cameras."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

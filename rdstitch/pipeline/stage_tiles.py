@@ -273,7 +273,7 @@ def _channels(count: int) -> str:
 def _grid(
     sources: Sequence[Source], frames: Sequence[Frame], stored: Mapping[Path, StoredTile], options: TileOptions
 ) -> TileGrid:
-    """Where the tiles should be; those of all that were named that are there, which moves none of them."""
+    """Where the tiles should be: counted over all that were named, so that a missing tile moves no other."""
     sizes = np.array([source.camera.image_size for source in sources], dtype=np.intp)
     width, height = sizes.max(axis=0).tolist()
     size, pixel_size = (width, height), options.pixel_size or sources[0].metadata.pixel_size

@@ -110,9 +110,9 @@ def _messages(sources: Sequence[Source], tiled: TileRegistration) -> tuple[Messa
             f"{_rms(tiled.stds[others]):.1f} pixels: {named(others)} have no link to the largest"
         )
         messages.append(Message(text, code="nominal-places"))
-    if len(astray := np.flatnonzero(tiled.linked & (tiled.off_stage > max(tiled.plan.search, 5.0 * fitted.stage.std)))):
-        off = ", ".join(f"{value:.0f}" for value in tiled.off_stage[astray][:MAX_NAMED])
-        messages.append(Message(f"not where the stage was sent, {off} pixels off by what they show: {named(astray)}"))
+    if len(moved := np.flatnonzero(tiled.linked & (tiled.off_stage > max(tiled.plan.search, 5.0 * fitted.stage.std)))):
+        off = ", ".join(f"{value:.0f}" for value in tiled.off_stage[moved][:MAX_NAMED])
+        messages.append(Message(f"not where the stage was sent, {off} pixels off by what they show: {named(moved)}"))
     if fitted.distortion != 0.0:
         text = (
             f"the lens, λ = {fitted.distortion:.4f}, is corrected by resampling; --lambda 0 keeps the measured samples"

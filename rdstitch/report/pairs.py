@@ -184,7 +184,7 @@ def residual_map(registration: Registration, residuals: Sequence[LinkResiduals])
     parts.append(label(0.0, map_height + 16, text))
     return section(
         "Residuals",
-        f"{len(error)} inliers of all pairs over the area of the image. Arrows that follow a pattern tell of something "
+        f"{len(error)} inliers of all pairs over the area of the image. Arrows that follow a pattern show something "
         "that the model does not describe: relief, a rolling shutter, a lens that one λ is not enough for.",
         drawing(_MAP_WIDTH, map_height + 22, parts, "residuals over the image"),
     )

@@ -22,7 +22,7 @@ _MAX_CHANCE = 1e-4  # probability that as many wrong matches agree by chance
 
 
 def binomial_tail(least: int, trials: int, probability: float) -> float:
-    """Probability that so many or more of independent events happen; SciPy's takes 0.05 to 0.12 s to import."""
+    """Probability of ``least`` or more of independent events; SciPy's takes 0.05 to 0.12 s to import."""
     count = np.arange(trials + 1)
     choices = np.append(0.0, np.cumsum(np.log((trials - count[:-1]) / count[1:])))
     logarithm = choices + count * math.log(probability) + (trials - count) * math.log1p(-probability)

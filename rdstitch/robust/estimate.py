@@ -245,7 +245,7 @@ def _selected(
 
 
 def _tilts(tilt: ArrayLike | None) -> FloatArray | None:
-    """Tilts of both images of each pair; None where none is known."""
+    """Tilts (2, 2) of both images, checked; None where they are not known."""
     if tilt is None:
         return None
     angles = as_numbers("tilt", tilt)

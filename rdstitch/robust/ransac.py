@@ -206,17 +206,15 @@ class _SolverState:
         The choice of the model refines the best of them again.
         """
         wide = 3.0 * self.options.threshold
-        free, best = HomographyPairModel(), start
+        free = HomographyPairModel()
         if self.solver.model == free:
             return self._refined(start, data, rows, free, wide)
         enough = start.inliers.sum(axis=1) >= _FREE_REFINEMENT
         for chosen, model in ((enough, free), (~enough, self.solver.model)):
             part = np.flatnonzero(chosen)
             if len(part):
-                refined = self._refined(best.take(part), data.take(part), rows[part], model, wide)
-                better = refined.cost < best.cost[part]
-                best.put(part[better], refined.take(better))
-        return best
+                start.put(part, self._refined(start.take(part), data.take(part), rows[part], model, wide))
+        return start
 
     def _refined(
         self, start: Hypotheses, data: Measurements, rows: IntArray, model: PairModel, scale: float

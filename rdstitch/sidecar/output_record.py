@@ -39,7 +39,7 @@ class GeoreferenceRecord(Struct, kw_only=True):
     def __post_init__(self) -> None:
         if self.crs is not None and (self.pixel_to_map is None or not any(self.pixel_to_map[0][:2])):
             raise ValueError("expected a similarity as pixel_to_map")
-        self.georeference()
+        self.georeference()  # refuses a coordinate system that is not known
 
     @classmethod
     def of(cls, place: Georeference) -> Self:

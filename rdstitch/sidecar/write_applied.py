@@ -1,4 +1,4 @@
-"""The sidecar of an image that was composed again: the registration of then, with the images that are in it now."""
+"""The sidecar of an image that was composed again: the saved registration, with the images that are in it now."""
 
 from pathlib import Path
 from typing import Any

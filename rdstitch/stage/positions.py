@@ -127,11 +127,8 @@ def grid_from_table(
     text = read_text(file)
     rows = _fiji_rows(text, file) or csv_rows(text, str(file), _COLUMNS, ("name,x,y", "name,x_um,y_um"))
     x, y, unit = ("x", "y", None) if any("x" in row.values for row in rows) else ("x_um", "y_um", 1.0)
-    places = []
-    for name, row in zip(names, RowsByImage(rows).of([Frame(Path(name), label=name) for name in names]), strict=True):
-        if row is None:
-            raise InputError(f"{file}: has no line for {name}; add one with its place")
-        places.append((row.needed(x), row.needed(y)))
+    tiles = [Frame(Path(name), label=name) for name in names]
+    places = [(row.needed(x), row.needed(y)) for row in RowsByImage(rows).needed(tiles, file, "place")]
     return _grid(np.array(places), unit, size, pixel_size, Path(file).name)
 
 

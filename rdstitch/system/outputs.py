@@ -66,7 +66,7 @@ class Outputs:
         self._folders: dict[Path, TemporaryFolder] = {}
         self._made: list[Path] = []  # folders for outputs, the inner ones first
         self._items: list[_Item] = []
-        self._number = 0  # of what is staged next
+        self._number = 0  # of the last name that was given
 
     @classmethod
     def or_own(cls, outputs: "Outputs | None", overwrite: bool = True) -> AbstractContextManager["Outputs"]:

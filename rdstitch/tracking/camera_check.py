@@ -7,7 +7,7 @@ from rdstitch.alignment.given_checks import LATE, judged_focal
 from rdstitch.alignment.sentences import attitudes_late, focal_contradicted
 from rdstitch.results.messages import Message
 from rdstitch.tracking.camera_from_motion import CameraEstimate, SeenPairs, camera_from_motion
-from rdstitch.tracking.camera_knowledge import CameraKnowledge, Estimate, FocalLength, FocalOrigin, keeps_height
+from rdstitch.tracking.camera_knowledge import CameraKnowledge, Estimate, FocalLength, FocalOrigin
 from rdstitch.tracking.frame_links import MATCH_ERROR
 from rdstitch.tracking.keyframe_map import KeyframeMap
 from rdstitch.tracking.metric_plane import MetricPlane
@@ -38,7 +38,7 @@ def check_given_camera(keyframe_map: KeyframeMap, latest: IncomingFrame) -> Came
     """Check a given camera by the keyframes; None where nothing was given, or it is not time for that."""
     knowledge, has_plane, added = keyframe_map.knowledge, keyframe_map.has_plane, keyframe_map.added
     focal, model = knowledge.focal, knowledge.one_tilt_model
-    if focal is None or not knowledge.is_metric(latest.camera) or model is None or not keeps_height(model):
+    if focal is None or not knowledge.is_metric(latest.camera) or model is None or not model.keeps_height:
         return None
     if not keyframe_map.links or (has_plane and added not in _CHECKS and added % _INTERVAL):
         return None

@@ -14,7 +14,7 @@ from rdstitch.inputs.delays import DELAY_STD
 _POINTS = 32  # of a pair; 16: NEES 0.78; 64: 1.06
 _OUTLIER = 3.0  # medians of the errors; 2: three claims beyond 5 σ; 5: NEES 0.81
 _TILT_STARTS = (0.0, 0.0), (0.35, 0.0), (-0.35, 0.0), (0.0, 0.35), (0.0, -0.35)
-_STEPS = 15  # of Gauss and Newton at the most
+_STEPS = 15  # Gauss-Newton steps, at most
 _HALVINGS = 6  # of a step, until errors become smaller
 _DIFFERENCE = 1e-5  # radians (of log focal length, s): by which derivatives are taken
 _SETTLED = 1e-6  # the same: a step that is the last

@@ -11,7 +11,7 @@ import numpy as np
 from rdstitch.alignment import Alignment, AlignmentOptions
 from rdstitch.alignment.delays import at_delay, change_with_delay
 from rdstitch.alignment.given_checks import judged_focal
-from rdstitch.alignment.motion_models import LOG_HEIGHT, MODELS, MotionModel
+from rdstitch.alignment.motion_models import MODELS, MotionModel
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import ModelName
 from rdstitch.geometry.camera import Camera
@@ -165,7 +165,7 @@ class CameraKnowledge:
         focal = FocalLength(camera.focal / camera.scale, log_std, FocalOrigin.GIVEN, log_std)
         if (tilt := self.given.tilt) is None:
             return replace(self, focal=focal)
-        return replace(self, focal=focal, model=model.name, plane=MetricPlane(focal.value, tilt, keeps_height(model)))
+        return replace(self, focal=focal, model=model.name, plane=MetricPlane(focal.value, tilt, model.keeps_height))
 
     def with_votes(self, links: Sequence[Link]) -> Self:
         """Estimate λ from the pairs alone, until there is an alignment."""
@@ -207,7 +207,7 @@ class CameraKnowledge:
             tilt = np.nanmedian(poses.tilt - attitudes, axis=0).tolist()
         given = self.given.tilt is not None
         tilt_std = None if given else math.sqrt(float(np.trace(alignment.covariance[:2, :2])))
-        return MetricPlane(focal.value, (tilt[0], tilt[1]), keeps_height(model), tilt_std)
+        return MetricPlane(focal.value, (tilt[0], tilt[1]), model.keeps_height, tilt_std)
 
     def covariance(self, placed: TrackedFrame, pose: CameraPose) -> FloatArray | None:
         """Covariance (4, 4) of a frame's pose, with what all frames have in common but for the unit of lengths."""
@@ -224,11 +224,6 @@ class CameraKnowledge:
             # The foot of the camera is off by the error of its tilt, and so is that of the first frame.
             place += 2.0 * (pose.height * self.attitude_std(placed.frame)) ** 2
         return np.asarray(covariance + np.diag([place, place, 0.0, shape.yaw**2]))
-
-
-def keeps_height(model: MotionModel) -> bool:
-    """Whether all cameras of a metric model are at one height above the plane."""
-    return LOG_HEIGHT not in model.free
 
 
 def _aligned_focal(alignment: Alignment) -> FocalLength | None:

@@ -1,1 +1,1 @@
-"""Poses of all images as a path: in a frame of the user, and beside the odometry of the robot that carried them."""
+"""Poses of all images as a path: in the frame of the first or on a map, and beside the odometry of the robot."""

@@ -1,4 +1,4 @@
-"""The path of the camera over the plane: poses frame by frame, files, and how far it is from the truth.
+"""The path of the camera over the plane: poses frame by frame.
 
 Positions are in units of the camera's height above the plane, in the plane's frame: x to the right and y downwards as
 the first frame sees them, yaw φ as in ``H ~ R Rz(φ) T R'``, so that a point X of the plane is seen by a camera at t in

@@ -128,7 +128,7 @@ def _free_homographies(evidence: ResultEvidence) -> Iterator[Finding]:
 def _unlike(evidence: ResultEvidence) -> Iterator[Finding]:
     """Images that were put together and are no more alike there than by chance.
 
-    Those of a picture neither at a coarse scale: depth shifts what it shows by a little nearly everywhere.
+    In a picture, they must be unlike at a coarse scale too: depth shifts what it shows a little nearly everywhere.
     """
     for link in evidence.checked:
         agreement = link.agreement
@@ -158,7 +158,9 @@ def _pattern(evidence: ResultEvidence) -> Iterator[Finding]:
     if len(evidence.ambiguous) > Limits.max_ambiguous_pairs * len(evidence.checked):
         yield Finding(Kind.PATTERN, "failure", (), {"count": len(evidence.ambiguous), "of": len(evidence.checked)})
     if settled := [link for link in evidence.checked if link.decided_by_unique_content]:
-        least_alike = min(settled, key=lambda link: link.agreement.confirming / max(link.agreement.cells, 1))
+        compared = [link.agreement for link in settled]
+        fractions = [each.confirming / each.cells if each.cells else 1.0 for each in compared]
+        least_alike = settled[fractions.index(min(fractions))]
         yield Finding(Kind.SETTLED_PATTERN, "warning", least_alike.pair)
 
 

@@ -89,7 +89,7 @@ def _cut_camera(camera: Camera, size: Size) -> Camera:
 def _with_scaled_lens(camera: Camera, ratio: float) -> Camera:
     """The same lens where half the diagonal is so many times as long.
 
-    λ is what a camera of that size can have at the most: only one pair's estimate is beyond, where no match reaches.
+    λ is limited to what a camera can have: only the estimate of a single pair lies beyond, where no match reaches.
     """
     powers = _powers(ratio)
     units, covariance = np.array([powers[name] for name in LENS_PARAMETERS]), camera.lens_covariance

@@ -147,7 +147,7 @@ class _Descent:
 _STEPS = 4  # linearizations at one width of the loss
 _LAST_STEPS = 12  # linearizations at the last width
 _NARROWING = 3.0  # factor by which the loss narrows from one width to the next
-_NARROW = 1.05  # last widths up to which a width is the last one
+_NARROW = 1.05  # ratio to the width that the scatter asks for, up to which a width is the last one
 _SETTLED = 0.02  # relative change of the errors' standard deviation that is none
 
 _FIRST_DAMPING = 1e-6

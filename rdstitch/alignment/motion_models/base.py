@@ -30,6 +30,7 @@ class MotionModel(ABC):
     one_camera: bool = True
     # whether each image has a tilt of its own, and whether it may be any, not only differ a little from a shared one
     free_tilts: bool = False
+    keeps_height: bool = False  # whether all images are at one height above a metric plane
     any_tilt: bool = False
     # Which columns of poses in a metric plane move, see :mod:`rdstitch.alignment.motion_models.planar`; none where
     # poses are of another kind
@@ -66,7 +67,7 @@ class MotionModel(ABC):
         return float(np.exp(self.log_focal(shared)))
 
     def log_focal(self, shared: FloatArray) -> float:
-        """Logarithm of it, the last of the shared parameters."""
+        """Logarithm of the focal length, the last of the shared parameters."""
         return float(shared[-1])
 
     @abstractmethod

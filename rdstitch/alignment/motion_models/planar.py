@@ -35,7 +35,7 @@ class PlanarModel(MotionModel):
 
     def __init__(self, name: ModelName, free: tuple[int, ...], *, any_tilt: bool = False) -> None:
         self.name, self.free, self.any_tilt = name, free, any_tilt
-        self.pose_size, self.free_tilts = len(free), PSI in free
+        self.pose_size, self.free_tilts, self.keeps_height = len(free), PSI in free, LOG_HEIGHT not in free
 
     @property
     def gauge(self) -> BoolArray:
@@ -139,7 +139,7 @@ class PlanarModel(MotionModel):
 
     def description(self, poses: FloatArray, shared: FloatArray) -> str:
         """What a fit says of the camera's height and tilt."""
-        if LOG_HEIGHT not in self.free:
+        if self.keeps_height:
             return "height and tilt stay the same"
         heights = f"heights differ by {float(np.std(poses[:, LOG_HEIGHT])):.0%}"
         if not self.free_tilts:
