@@ -131,7 +131,8 @@ def test_what_is_damaged_in_one_band_is_said_of_that_band_alone(rig: Path, tmp_p
         frame = cv2.imread(str(rig / "nir" / name.format("NIR")))
         assert frame is not None
         coded = cv2.imencode(".jpg", frame)[1].tobytes()
-        (tmp_path / f"{name.format('NIR')[:-4]}.jpg").write_bytes(coded.replace(coded[-300:-260], bytes(40)) if k == 1 else coded)
+        content = coded.replace(coded[-300:-260], bytes(40)) if k == 1 else coded
+        (tmp_path / name.format("NIR")).with_suffix(".jpg").write_bytes(content)
         cv2.imwrite(str(tmp_path / name.format("RE")), frame)
     bands = {"RED": "*_red.png", "NIR": "*_NIR.jpg", "RE": "*_RE.png"}
     _, (nir, edge) = mosaic_bands([rig / "red", tmp_path], tmp_path / "f.tif", bands, StitchOptions(workers=1))
