@@ -40,6 +40,7 @@ class ProcessExecutor(Executor):
     """
 
     def __init__(self, workers: int) -> None:
+        self.workers = workers
         self._threads, self._own = ThreadPoolExecutor(workers), threading.local()
         self._workers: list[subprocess.Popen[bytes]] = []
         self._lock, self._stopped = threading.Lock(), False
