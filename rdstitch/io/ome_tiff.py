@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rdstitch.io.pyramid import pyramid, pyramid_sizes
 from rdstitch.io.strips import STRIP_ROWS, ImageSpec, Strip, placed_rows, zero_uncovered
-from rdstitch.io.tiff import MIN_OVERVIEW, TILE, ExtraTag, copied_tags, encoded_tile, has_predictor, tiles_of
+from rdstitch.io.tiff import MIN_OVERVIEW, ExtraTag, copied_tags, tiled, tiles_of
 from rdstitch.system.late_imports import tifffile
 
 OME_SUFFIXES = (".ome.tif", ".ome.tiff")
@@ -41,18 +41,15 @@ def write_ome_tiff(path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_t
                 tops = range(0, height, STRIP_ROWS)
                 shown = (np.ascontiguousarray(part[top : top + STRIP_ROWS]) for part in parts for top in tops)
                 tiff.write(
-                    (encoded_tile(tile) for tile in tiles_of(shown)),
+                    tiles_of(shown),
                     shape=(channels, height, width) if separate else (height, width, channels),
-                    dtype=spec.dtype,
+                    **tiled(spec.dtype),
+                    maxworkers=1,
                     photometric="minisblack" if separate else "rgb",
                     planarconfig=None if separate else "contig",
-                    tile=(TILE, TILE),
-                    compression="zlib",
-                    predictor=has_predictor(spec.dtype),
                     subifds=None if number else len(levels) - 1,
                     subfiletype=1 if number else 0,
                     metadata=None if number else _ome_metadata(spec, pixels, separate=separate),
-                    software="rdstitch",
                     iccprofile=None if number else spec.metadata.icc_profile or None,
                     extratags=[] if number else [*copied_tags(spec.metadata), *extra_tags],
                 )
