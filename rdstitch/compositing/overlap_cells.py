@@ -87,7 +87,7 @@ def compare_overlaps(survey: Survey, workers: int = 1) -> Cells | None:
         """The cells of some pairs."""
         of_pairs = []
         for index, (i, j) in enumerate(pairs[first : first + _PAIRS_AT_A_TIME].tolist(), start=first):
-            _, _, box, seen = survey.overlap(i, j)
+            box, seen = survey.overlap(i, j)
             overlap_fractions[index] = np.count_nonzero(seen) / min(shown[i].area, shown[j].area)
             for middles, means in _cells_of_overlap(shown[i], shown[j], box):
                 every = max(1, -(-len(means) * len(pairs) // _MAX_CELLS))

@@ -50,14 +50,14 @@ class Survey:
         """Pairs (P, 2) of images that lie over each other; see :func:`overlapping_pairs`."""
         return overlapping_pairs([None if tile is None else tile.box for tile in self.tiles])
 
-    def overlap(self, i: int, j: int) -> tuple[SurveyTile, SurveyTile, Box, NDArray[np.bool_]]:
-        """The tiles of one of the pairs, the box that they have in common, and where both images show in it."""
+    def overlap(self, i: int, j: int) -> tuple[Box, NDArray[np.bool_]]:
+        """The box that the tiles of one of the pairs have in common, and where both images show in it."""
         a, b = self.tiles[i], self.tiles[j]
         assert a is not None
         assert b is not None
         box = intersection(a.box, b.box)
         assert box is not None
-        return a, b, box, cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
+        return box, cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
 
     def seam_quality(self, labels: NDArray[np.int32]) -> SeamQuality:
         """What seams are like, in canvas pixels; ``labels`` are the owners of the reduced canvas."""
