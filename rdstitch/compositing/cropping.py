@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import BoolArray
 from rdstitch.compositing.boxes import Box, cut
 from rdstitch.compositing.survey import Survey
 
@@ -15,7 +15,7 @@ _RESOLUTION = 1500
 _MIN_KEPT = 0.25
 
 
-def covered_pixels(survey: Survey) -> NDArray[np.bool_]:
+def covered_pixels(survey: Survey) -> BoolArray:
     """Which pixels of the reduced canvas images cover."""
     covered = np.zeros(survey.canvas.size[::-1], dtype=np.bool_)
     for tile in survey.tiles:
@@ -31,7 +31,7 @@ class Crop(NamedTuple):
     kept: float  # fraction of what is covered that it keeps
 
 
-def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> Crop:
+def crop_box(covered: BoolArray, factor: int, size: tuple[int, int]) -> Crop:
     """Find the largest rectangle without holes.
 
     ``covered`` as of :func:`covered_pixels`, of which each takes ``factor`` pixels a side of a canvas of this size.
@@ -51,7 +51,7 @@ def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> 
     return Crop((x0 * unit, y0 * unit, min(x1 * unit, size[0]), min(y1 * unit, size[1])), kept)
 
 
-def crop_rows(covered: NDArray[np.bool_], factor: int, size: tuple[int, int], whole: Box) -> Crop:
+def crop_rows(covered: BoolArray, factor: int, size: tuple[int, int], whole: Box) -> Crop:
     """Find the most rows without holes, at their full width, of a canvas that goes all the way round.
 
     ``whole`` is one full turn of it.
@@ -68,7 +68,7 @@ def crop_rows(covered: NDArray[np.bool_], factor: int, size: tuple[int, int], wh
     return Crop((whole[0], int(first) * factor, whole[2], min(int(last) * factor, size[1])), kept)
 
 
-def largest_rectangle(cells: NDArray[np.bool_]) -> Box:
+def largest_rectangle(cells: BoolArray) -> Box:
     """Largest upright rectangle of true cells: x0, y0, x1, y1, end exclusive; empty where there is none.
 
     Row by row, the height of the column of true cells above each cell, and for each the widest run of columns at least

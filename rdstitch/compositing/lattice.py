@@ -6,8 +6,8 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
-from rdstitch.compositing.boxes import Box, Float32Array
+from rdstitch.arrays import Float32Array, FloatArray
+from rdstitch.compositing.boxes import Box
 
 LATTICE_STEPS = (32, 16, 8, 4, 2, 1)  # spacings of lattices, canvas pixels; all have the nodes of the first
 _NOWHERE = np.float32(-1e6)

@@ -15,15 +15,15 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.render import Renderer
 from rdstitch.io.strips import STRIP_ROWS
 from rdstitch.system.cache import Cache, Stored
 from rdstitch.system.progress import FractionProgress, no_progress
 
-OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]
+OutputStrip = tuple[AnyArray, UInt8Array]
 """Samples (h, W, C) and alpha (h, W)."""
 
 

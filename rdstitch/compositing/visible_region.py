@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import Camera, points_over
 from rdstitch.io.read import DecodedImage
 
@@ -48,7 +47,7 @@ class VisibleRegion:
         kept = border[: last + 1][inside[: last + 1]]
         return np.concatenate([kept, measured[np.isfinite(measured).all(axis=1)]])
 
-    def shows(self, points: FloatArray) -> NDArray[np.bool_]:
+    def shows(self, points: FloatArray) -> BoolArray:
         """Which measured pixels (K, 2) are drawn."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self._value(self.camera.normalize(self.camera.undistort(points))) > 0.0)
@@ -60,7 +59,7 @@ class VisibleRegion:
         alpha = np.where(shown, np.uint8(255) if image.alpha is None else image.alpha, np.uint8(0))
         return replace(image, alpha=alpha)
 
-    def _shown(self, width: int, height: int) -> NDArray[np.bool_]:
+    def _shown(self, width: int, height: int) -> BoolArray:
         """Which pixels of the image at a size are drawn; in measured coordinates the limit is a conic."""
         camera = self.camera.resized((width, height))
         x = (np.arange(width) - camera.center[0]) / camera.scale

@@ -4,13 +4,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
-from rdstitch.compositing.boxes import Box, Float32Array, encloses, grown, intersection
+from rdstitch.arrays import AnyArray, BoolArray, Float32Array, FloatArray
+from rdstitch.compositing.boxes import Box, encloses, grown, intersection
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.lattice import LATTICE_STEPS, Lattice
 from rdstitch.compositing.projection import PLANE, Projection
@@ -77,10 +76,10 @@ class Warp:
             return replace(finer, from_canvas=self.from_canvas @ back)
         return replace(finer, surface=replace(self.surface, from_canvas=self.surface.from_canvas @ back))
 
-    def contains(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
+    def contains(self, x: AnyArray, y: AnyArray) -> BoolArray:
         """Which measured pixels lie in the image; NaN does not."""
         width, height = self.camera.image_size
-        within: NDArray[np.bool_] = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
+        within: BoolArray = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
         if (radius := self.camera.drawn_radius) < math.inf:
             within &= (x - self.camera.center[0]) ** 2 + (y - self.camera.center[1]) ** 2 <= radius**2
         return within
@@ -113,7 +112,7 @@ class Geometry:
         return drawn and bool((points >= 0).all() and (points <= limit).all())
 
     @cached_property
-    def inside(self) -> NDArray[np.bool_]:
+    def inside(self) -> BoolArray:
         """Which pixels (h, w) lie in the image."""
         return np.ones(self.shape, dtype=np.bool_) if self.filled else self.warp.contains(*self.maps)
 

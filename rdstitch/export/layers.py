@@ -4,11 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.compositing.boxes import intersection
 from rdstitch.compositing.preparation import decide, prepare_composite
 from rdstitch.errors import OutputError
@@ -99,8 +98,8 @@ def stage_layers(result: OutputImage, files: Mapping[str, tuple[Path, Path]], ou
 
 def _write_cropped_tiff(
     path: Path,
-    pixels: NDArray[Any],
-    alpha: NDArray[np.uint8] | None,
+    pixels: AnyArray,
+    alpha: UInt8Array | None,
     offset: tuple[int, int],
     size: tuple[int, int],
     extra_tags: Sequence[ExtraTag] = (),

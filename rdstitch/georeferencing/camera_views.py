@@ -6,13 +6,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import to_plane
-
-ComplexArray = NDArray[np.complex128]
 
 _TILT_STD = math.radians(3.0)  # of a camera that is taken to look straight down, and of an attitude
 _METRIC = 1e-4  # by which the axes of a plane seen from above differ, of their length: rounding

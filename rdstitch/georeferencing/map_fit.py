@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.georeferencing.camera_views import ComplexArray, Views
+from rdstitch.arrays import BoolArray, ComplexArray, FloatArray
+from rdstitch.georeferencing.camera_views import Views
 from rdstitch.robust.similarity_fit import OUTLYING, fit_similarity
 
 SLOPE_STD = math.radians(1.0)  # of the ground: level to gently sloping in the classes of the FAO (up to 5 %)

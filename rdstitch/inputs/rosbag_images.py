@@ -8,9 +8,9 @@ from typing import Any, Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.keyframes import FrameSelection, wanted_frames
@@ -69,7 +69,7 @@ class _Messages:
         images = [c for c in reader.connections if c.topic == chosen and c.msgtype in IMAGE_TYPES]
         return cls(reader, images, path)
 
-    def grey(self) -> Iterator[NDArray[np.uint8] | None]:
+    def grey(self) -> Iterator[UInt8Array | None]:
         """All of them, (H, W), 8 bits; None where one cannot be decoded."""
         for connection, _, data in self.reader.messages(connections=self.connections):
             message = self.reader.deserialize(data, connection.msgtype)
@@ -98,7 +98,7 @@ class _Messages:
             yield Frame(file, number, stamp or time_ns * 1e-9)
 
 
-def _eight_bits(grey: NDArray[Any]) -> NDArray[np.uint8]:
+def _eight_bits(grey: AnyArray) -> UInt8Array:
     """Grey of 8 bits, the same at any exposure: sensors of 10 or 12 bits leave the highest ones empty."""
     if grey.dtype == np.uint8:
         return grey
@@ -106,7 +106,7 @@ def _eight_bits(grey: NDArray[Any]) -> NDArray[np.uint8]:
     return np.clip(grey * (255.0 / brightest), 0.0, 255.0).astype(np.uint8)
 
 
-def _grey_of_compressed(data: NDArray[np.uint8]) -> NDArray[Any] | None:
+def _grey_of_compressed(data: UInt8Array) -> AnyArray | None:
     """A JPEG or PNG image, (H, W), of 8 or 16 bits; None where it cannot be decoded."""
     try:
         # Not by OpenCV, whose decoders write on standard error.
@@ -117,7 +117,7 @@ def _grey_of_compressed(data: NDArray[np.uint8]) -> NDArray[Any] | None:
         return None
 
 
-def _pixels(path: Path, message: Any) -> NDArray[Any]:
+def _pixels(path: Path, message: Any) -> AnyArray:
     """Samples of an uncompressed image, grey or BGR; rows may be padded, and bytes swapped."""
     if message.encoding not in _ENCODINGS:
         known = ", ".join(_ENCODINGS)

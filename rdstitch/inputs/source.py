@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import UInt8Array
 from rdstitch.errors import ArgumentError, InputError, LimitError, RdstitchError
 from rdstitch.features.prepared_image import View, halving
 from rdstitch.geometry.camera import Camera
@@ -158,7 +158,7 @@ class Source:
         return _masked(image, as_alpha(inside))
 
 
-def _masked(image: DecodedImage, alpha: NDArray[np.uint8]) -> DecodedImage:
+def _masked(image: DecodedImage, alpha: UInt8Array) -> DecodedImage:
     """The image where both its own alpha and another one have it."""
     return replace(image, alpha=alpha if image.alpha is None else np.minimum(image.alpha, alpha))
 

@@ -2,13 +2,12 @@
 
 import io
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import AnyArray, FloatArray
 from rdstitch.io.samples import ROWS_AT_A_TIME
 
 if TYPE_CHECKING:
@@ -22,7 +21,7 @@ _XYZ_TO_RGB = np.array(
 _EDGE = 6.0 / 29.0  # where the cube root of CIE 1976 becomes a line
 
 
-def srgb_of_lab(lab: NDArray[Any], *, signed: bool) -> NDArray[Any]:
+def srgb_of_lab(lab: AnyArray, *, signed: bool) -> AnyArray:
     """Samples of CIELAB (h, w, 3), 8 or 16 bits as TIFF stores them, as sRGB of the same type.
 
     In TIFF's own CIELAB a* and b* are signed; else they are offset by half of their range, as profiles have them.
@@ -34,7 +33,7 @@ def srgb_of_lab(lab: NDArray[Any], *, signed: bool) -> NDArray[Any]:
     return rgb
 
 
-def _srgb_of_lab(lab: NDArray[Any], *, signed: bool) -> FloatArray:
+def _srgb_of_lab(lab: AnyArray, *, signed: bool) -> FloatArray:
     full = np.iinfo(lab.dtype).max
     unit = (full + 1) // 256
     chroma = lab[..., 1:].view(f"i{lab.dtype.itemsize}") if signed else lab[..., 1:].astype(np.int64) - 128 * unit

@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, Float32Array
 from rdstitch.errors import InputError
 from rdstitch.io.opening import check_readable, decoding
 from rdstitch.io.read_tiff import image_pages
@@ -19,10 +18,10 @@ from rdstitch.system.late_imports import tifffile
 class FlatField:
     """Illumination of all images of a camera: ``measured = gain * light + dark``."""
 
-    gain: NDArray[np.float32]  # (h, w, C), float32: mean 1 in each channel
-    dark: NDArray[np.float32]  # (h, w, C) or (1, 1, C), float32: samples without light
+    gain: Float32Array  # (h, w, C), float32: mean 1 in each channel
+    dark: Float32Array  # (h, w, C) or (1, 1, C), float32: samples without light
 
-    def corrected(self, pixels: NDArray[Any], reduction: int = 1) -> NDArray[Any]:
+    def corrected(self, pixels: AnyArray, reduction: int = 1) -> AnyArray:
         """``(v - dark) / gain + dark`` of samples (h, w) or (h, w, C), reduced or not, in their type.
 
         The dark level stays, so that noise about it is not cut off at 0.

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, Float32Array, FloatArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.io.read import DecodedImage, Pixels
+from rdstitch.io.read import DecodedImage
 
 _NODES = 320  # along the width, at which the displacement is computed
 _MAX_STEP = 8  # pixels between nodes
@@ -37,7 +37,7 @@ def corrected(image: DecodedImage, camera: Camera, reduction: int) -> DecodedIma
     return replace(image, pixels=pixels, alpha=None if whole else opaque)
 
 
-def _places(camera: Camera, reduction: int, top: int, count: int, width: int) -> NDArray[np.float64]:
+def _places(camera: Camera, reduction: int, top: int, count: int, width: int) -> FloatArray:
     """Where the lens shows the pixels of ``count`` rows, pixels (R, W, 2) of the image; NaN where it does not."""
     step, moved = _moved(camera, reduction, top, count, width)
     whole = cv2.resize(moved, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
@@ -45,8 +45,8 @@ def _places(camera: Camera, reduction: int, top: int, count: int, width: int) ->
     return np.asarray(whole[step : step + count, step : step + width] + pixel)
 
 
-def _moved(camera: Camera, reduction: int, top: int, count: int, width: int) -> tuple[int, NDArray[np.float64]]:
-    """Pixels between nodes over ``count`` rows, and by how much the lens moves what is at each."""
+def _moved(camera: Camera, reduction: int, top: int, count: int, width: int) -> tuple[int, FloatArray]:
+    """AnyArray between nodes over ``count`` rows, and by how much the lens moves what is at each."""
     step = min(max(width // _NODES, 1), _MAX_STEP)
     # A step beyond each side: what is interpolated is never extrapolated.
     nodes = [np.arange(-1, -(-side // step) + 1) * step + (step - 1) / 2 for side in (width, count)]
@@ -58,7 +58,7 @@ def _moved(camera: Camera, reduction: int, top: int, count: int, width: int) -> 
     return step, shown - grid
 
 
-def _resampled(pixels: Pixels, x: NDArray[np.float32], y: NDArray[np.float32]) -> Pixels:
+def _resampled(pixels: AnyArray, x: Float32Array, y: Float32Array) -> AnyArray:
     """Samples (H, W) or (H, W, C) at places (R, W)."""
     if pixels.ndim == 3 and pixels.shape[2] > _CHANNELS:
         bands = [_resampled(np.ascontiguousarray(pixels[..., k]), x, y) for k in range(pixels.shape[2])]

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import UInt8Array
 from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import inverse, turned, turned_size
 from rdstitch.io.metadata import read_metadata
@@ -20,7 +20,7 @@ class Mask:
     path: Path
     frame: int | None = None  # how it is turned, see :func:`mask_frame`
 
-    def read(self, size: tuple[int, int]) -> NDArray[np.uint8]:
+    def read(self, size: tuple[int, int]) -> UInt8Array:
         """Alpha of an image of a size."""
         return read_mask(self.path, size, self.frame)
 
@@ -46,7 +46,7 @@ def mask_frame(
     )
 
 
-def read_mask(path: str | Path, size: tuple[int, int], frame: int | None = None) -> NDArray[np.uint8]:
+def read_mask(path: str | Path, size: tuple[int, int], frame: int | None = None) -> UInt8Array:
     """Read a mask as alpha (height, width) for an image: 255 where the image counts, 0 where it is excluded.
 
     What is darker than half of the mask's brightest value is excluded, so that masks of 0 and 1, masks of 0 and 255,

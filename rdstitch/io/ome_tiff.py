@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray
 from rdstitch.io.pyramid import pyramid, pyramid_sizes
 from rdstitch.io.strips import STRIP_ROWS, ImageSpec, Strip, placed_rows, zero_uncovered
 from rdstitch.io.tiff import MIN_OVERVIEW, ExtraTag, copied_tags, tiled, tiles_of
@@ -27,7 +27,7 @@ def write_ome_tiff(path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_t
     separate = spec.metadata.planes or spec.channels != 3
     passing_levels = pyramid(sizes, zero_uncovered(strips), path.parent, transparent=False)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        levels: list[NDArray[Any]] = []
+        levels: list[AnyArray] = []
         for number, ((width, height), passing) in enumerate(passing_levels):
             level = np.memmap(Path(folder) / str(number), spec.dtype, "w+", shape=(height, width, spec.channels))
             for at, rows in placed_rows(passing):
@@ -55,7 +55,7 @@ def write_ome_tiff(path: Path, spec: ImageSpec, strips: Iterable[Strip], extra_t
                 )
 
 
-def _ome_metadata(spec: ImageSpec, pixels: NDArray[Any], *, separate: bool) -> dict[str, Any]:
+def _ome_metadata(spec: ImageSpec, pixels: AnyArray, *, separate: bool) -> dict[str, Any]:
     """What OME-XML says of the image, whose channels are pages where they are ``separate``."""
     samples = hashlib.sha256(pixels.data).hexdigest()
     identity = uuid.uuid5(uuid.NAMESPACE_OID, f"rdstitch {spec.size} {spec.channels} {spec.dtype} {samples}")

@@ -15,8 +15,8 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.choices import ZPlane
 from rdstitch.errors import InputError
 from rdstitch.io.ome import MICROMETRES, Page, ome_pixel_size, ome_planes, ome_tree
@@ -52,7 +52,7 @@ class StoredTile:
         """Whether it is what any reader makes of its file."""
         return list(self.planes.values()) == [Page(self.name, 0)]
 
-    def read(self, z: ZPlane, time: int) -> tuple[NDArray[Any], NDArray[np.uint8] | None]:
+    def read(self, z: ZPlane, time: int) -> tuple[AnyArray, UInt8Array | None]:
         """Samples (h, w), or (h, w, C) of several channels, and alpha, of a z plane or the brightest of all."""
         channels, depth, _ = self.counts
         wanted = range(depth) if z == "max" else [z]
@@ -92,7 +92,7 @@ def _tiff(stream: Any, file: Path) -> "tifffile.TiffFile":
     return tifffile.TiffFile(stream, name=str(file))
 
 
-def _samples(tiff: "tifffile.TiffFile", number: int) -> tuple[NDArray[Any], NDArray[np.uint8] | None]:
+def _samples(tiff: "tifffile.TiffFile", number: int) -> tuple[AnyArray, UInt8Array | None]:
     if number < len(tiff.pages):
         page = tiff.pages[number]
         return read_page(tiff, page if isinstance(page, tifffile.TiffPage) else page.aspage())

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+from rdstitch.arrays import AnyArray
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.pyramid import pyramid, pyramid_sizes
 from rdstitch.io.samples import as_alpha
@@ -116,7 +116,7 @@ def tiled(dtype: np.dtype[Any]) -> dict[str, Any]:
     return {"dtype": dtype, "tile": (TILE, TILE), **packing, "software": "rdstitch"}
 
 
-def _without_alpha(strips: Iterable[NDArray[Any]], mask: list[bytes]) -> Iterator[NDArray[Any]]:
+def _without_alpha(strips: Iterable[AnyArray], mask: list[bytes]) -> Iterator[AnyArray]:
     """The strips without alpha; tiles of where that is not 0, one bit a pixel, are added to ``mask`` as stored."""
     for strip in strips:
         bits = (np.packbits(tile[..., 0], axis=1) for tile in tiles_of([strip[..., -1:] > 0]))
@@ -149,7 +149,7 @@ def copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:
                 yield int(tag), 2, 0, text, True
 
 
-def tiles_of(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+def tiles_of(strips: Iterable[AnyArray]) -> Iterator[AnyArray]:
     """Tiles in the order of the file; those at the right and lower border completed."""
     for strip in strips:
         for y in range(0, strip.shape[0], TILE):

@@ -9,12 +9,12 @@ import os
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.errors import ArgumentError
 from rdstitch.io.deepzoom import write_deep_zoom
 from rdstitch.io.fingerprint import Fingerprint, fingerprint
@@ -39,8 +39,8 @@ _ROWS_AT_A_TIME = 4 * STRIP_ROWS
 
 def write_image(
     path: str | Path,
-    pixels: NDArray[Any],
-    alpha: NDArray[np.uint8] | None = None,
+    pixels: AnyArray,
+    alpha: UInt8Array | None = None,
     metadata: Metadata | None = None,
     *,
     quality: int = 95,

@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.errors import LimitError
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.strips import ImageSpec, Strip, as_eight_bit
@@ -49,7 +49,7 @@ def _encoded(spec: ImageSpec, strips: Iterable[Strip], workers: int) -> Iterator
         yield from in_order_ahead(pool, lambda strip: _jpeg(spec, *strip), strips, _ENCODERS)
 
 
-def _jpeg(spec: ImageSpec, samples: NDArray[np.generic], alpha: NDArray[np.uint8] | None) -> bytes:
+def _jpeg(spec: ImageSpec, samples: AnyArray, alpha: UInt8Array | None) -> bytes:
     """One strip as a JPEG file of its own, with a restart marker after each row of blocks."""
     eight = as_eight_bit(samples)
     if spec.channels == 1:

@@ -6,9 +6,8 @@ from html import escape
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import AnyArray, FloatArray
 from rdstitch.errors import InputError
 from rdstitch.inputs.source import Source
 from rdstitch.io.preview import encode_preview
@@ -109,6 +108,6 @@ def of_source(source: Source, side: int) -> str | None:
         return None
 
 
-def data_address(pixels: NDArray[Any], side: int) -> str:
+def data_address(pixels: AnyArray, side: int) -> str:
     """An image of any sample type as JPEG inside a ``data:`` address, its longer side at most ``side`` pixels."""
     return "data:image/jpeg;base64," + base64.b64encode(encode_preview(pixels, side)).decode("ascii")
