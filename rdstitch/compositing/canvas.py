@@ -101,8 +101,7 @@ class Canvas:
         if self.projection == PLANE:
             return to_plane(camera, self.matrix @ homography, points)
         directions = to_directions(camera, homography, points)
-        places: FloatArray = self.projection.project(directions) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
-        return places
+        return np.asarray(self.projection.project(directions) @ self.matrix[:2, :2].T + self.matrix[:2, 2])
 
     def cut_away(self, cameras: Sequence[Camera], homographies: FloatArray) -> float:
         """Share of what the images show that has no place here, because it would be stretched too much."""

@@ -232,8 +232,7 @@ def directions_on(canvas: Canvas, points: FloatArray) -> FloatArray:
     places = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(canvas.matrix).T
     parts = canvas.projection.directions(places[:, 0], places[:, 1])
     directions = np.stack(np.broadcast_arrays(*parts), axis=-1)
-    unit: FloatArray = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    return unit
+    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
 
 def field_of_view(canvas: Canvas) -> tuple[float, float]:

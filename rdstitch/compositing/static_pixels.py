@@ -64,8 +64,7 @@ def _tensor(slope: Float32Array) -> Float32Array:
 def _smaller_eigenvalue(tensor: Float32Array, window: int) -> Float32Array:
     """Smaller eigenvalue of the structure tensor (3, h, w), averaged over a window."""
     xx, yy, xy = (cv2.boxFilter(part, -1, (window, window)) for part in tensor)
-    smaller: Float32Array = (xx + yy) / 2.0 - np.sqrt(((xx - yy) / 2.0) ** 2 + xy**2)
-    return smaller
+    return np.asarray((xx + yy) / 2.0 - np.sqrt(((xx - yy) / 2.0) ** 2 + xy**2))
 
 
 def _with_captions(static: BoolArray, same: BoolArray, window: int) -> BoolArray:

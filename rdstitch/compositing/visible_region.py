@@ -76,14 +76,12 @@ class VisibleRegion:
 
     def _value(self, flat: FloatArray) -> FloatArray:
         """What is positive where undistorted points (K, 2) are drawn."""
-        value: FloatArray = flat @ self.depth[:2] + self.depth[2]
-        return value
+        return np.asarray(flat @ self.depth[:2] + self.depth[2])
 
     def _crossing(self, inside: FloatArray, outside: FloatArray) -> FloatArray:
         """Where the line between two undistorted points meets the limit."""
         a, b = self._value(np.stack([inside, outside]))
-        crossing: FloatArray = inside + (outside - inside) * (a / (a - b))
-        return crossing
+        return np.asarray(inside + (outside - inside) * (a / (a - b)))
 
 
 def visible_regions(

@@ -82,8 +82,7 @@ def _below(camera: Camera, nadir: tuple[float, float, float] | None) -> FloatArr
     """The pixel straight below a camera by its attitude; None where that is not known or not ahead."""
     if nadir is None or camera.focal is None or nadir[2] <= 0.0:
         return None
-    pixel: FloatArray = camera.distort(np.array([camera.center]) + np.array([nadir[:2]]) / nadir[2] * camera.focal)[0]
-    return pixel
+    return np.asarray(camera.distort(np.array([camera.center]) + np.array([nadir[:2]]) / nadir[2] * camera.focal)[0])
 
 
 def _centres(cameras: Sequence[Camera], focal: FloatArray, to_output: FloatArray) -> FloatArray | None:

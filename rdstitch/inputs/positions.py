@@ -74,8 +74,7 @@ def metres_around_median(known: Sequence[GpsPosition | None]) -> FloatArray:
     metres = np.full((len(known), 2), np.nan)
     metres[places] = Crs.nearest(latitude[places], longitude[places]).project(latitude[places], longitude[places])
     metres[~np.isfinite(metres).all(axis=1)] = np.nan
-    around: FloatArray = metres - np.nanmedian(metres, axis=0)
-    return around
+    return np.asarray(metres - np.nanmedian(metres, axis=0))
 
 
 def with_positions(

@@ -42,8 +42,7 @@ def _srgb_of_lab(lab: AnyArray, *, signed: bool) -> FloatArray:
     xyz = np.where(cube > _EDGE, cube**3, 3.0 * _EDGE**2 * (cube - 4.0 / 29.0)) * _WHITE
     linear = np.clip(xyz @ _XYZ_TO_RGB.T, 0.0, 1.0)
     gamma = np.where(linear > 0.0031308, 1.055 * linear ** (1.0 / 2.4) - 0.055, 12.92 * linear)
-    samples: FloatArray = np.rint(gamma * full)
-    return samples
+    return np.asarray(np.rint(gamma * full))
 
 
 def ink_transform(profile: bytes) -> "ImageCms.ImageCmsTransform | None":
