@@ -24,7 +24,7 @@ from rdstitch.io.write import write_strips
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.results.messages import Message
 from rdstitch.system.outputs import Outputs
-from rdstitch.system.progress import FractionProgress, no_progress
+from rdstitch.system.progress import FractionProgress, silent
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -59,7 +59,7 @@ def compose(images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOpt
 
 
 def compose_decided(
-    decisions: Decisions, progress: FractionProgress = no_progress, elsewhere: BlockRunner | None = None
+    decisions: Decisions, progress: FractionProgress = silent, elsewhere: BlockRunner | None = None
 ) -> Composite:
     """Put images together, in memory, once exposure and seams are decided.
 
@@ -81,7 +81,7 @@ def compose_decided(
 def compose_to_file(
     path: str | Path,
     decisions: Decisions,
-    progress: FractionProgress = no_progress,
+    progress: FractionProgress = silent,
     elsewhere: BlockRunner | None = None,
     *,
     metadata: Metadata | None = None,
