@@ -70,9 +70,12 @@ class Canvas:
 
     def on_grid(self, matrix: FloatArray, size: tuple[int, int]) -> "Canvas":
         """The same plane on other pixels, which images may lie beyond."""
-        change = matrix @ np.linalg.inv(self.matrix)
+        return replace(self._changed(matrix @ np.linalg.inv(self.matrix), size), matrix=matrix)
+
+    def _changed(self, change: FloatArray, size: tuple[int, int]) -> "Canvas":
+        """Other pixels, to which a similarity (3, 3) leads."""
         outlines = tuple(outline @ change[:2, :2].T + change[:2, 2] for outline in self.footprints)
-        return replace(self, size=size, matrix=matrix, footprints=outlines)
+        return replace(self, size=size, matrix=change @ self.matrix, footprints=outlines)
 
     def areas(self) -> list[int]:
         """Area of the bounds of every image, as if it had only one place on the canvas, square pixels."""
@@ -119,13 +122,10 @@ class Canvas:
         """The part (x0, y0, x1, y1) of this canvas as a canvas of its own."""
         x0, y0, x1, y1 = box
         shift = np.array([[1.0, 0.0, -x0], [0.0, 1.0, -y0], [0.0, 0.0, 1.0]])
-        footprints = tuple(outline - (x0, y0) for outline in self.footprints)
-        wanted = None
-        if self.cropped_to is not None:
-            left, top, right, bottom = self.cropped_to
-            wanted = left - x0, top - y0, right - x0, bottom - y0
-        size = x1 - x0, y1 - y0
-        return replace(self, size=size, matrix=shift @ self.matrix, footprints=footprints, cropped_to=wanted)
+        wanted = self.cropped_to
+        if wanted is not None:
+            wanted = wanted[0] - x0, wanted[1] - y0, wanted[2] - x0, wanted[3] - y0
+        return replace(self._changed(shift, (x1 - x0, y1 - y0)), cropped_to=wanted)
 
     def widened(self, margin: int) -> "Canvas":
         """The same with ``margin`` pixels more on the left and on the right."""
@@ -136,14 +136,9 @@ class Canvas:
         width, height = (-(-n // factor) for n in self.size)
         shift = 0.5 / factor - 0.5
         to_reduced = np.array([[1.0 / factor, 0.0, shift], [0.0, 1.0 / factor, shift], [0.0, 0.0, 1.0]])
-        return replace(
-            self,
-            size=(width, height),
-            matrix=to_reduced @ self.matrix,
-            footprints=tuple(outline / factor + shift for outline in self.footprints),
-            period=None if self.period is None else self.period / factor,
-            cropped_to=None,  # what a crop leaves is decided at full size
-        )
+        period = None if self.period is None else self.period / factor
+        # What a crop leaves is decided at full size.
+        return replace(self._changed(to_reduced, (width, height)), period=period, cropped_to=None)
 
 
 def plan_canvas(

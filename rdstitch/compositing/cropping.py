@@ -45,10 +45,9 @@ def crop_box(covered: BoolArray, factor: int, size: tuple[int, int]) -> Crop:
     cells = whole[: rows * coarse, : columns * coarse].reshape(rows, coarse, columns, coarse).min(axis=(1, 3)) > 0
     x0, y0, x1, y1 = largest_rectangle(cells)
     kept = (x1 - x0) * (y1 - y0) * coarse**2 / max(1, int(covered.sum()))
-    if kept < _MIN_KEPT:
-        return Crop(None, kept)
     unit = coarse * factor
-    return Crop((x0 * unit, y0 * unit, min(x1 * unit, size[0]), min(y1 * unit, size[1])), kept)
+    box = x0 * unit, y0 * unit, min(x1 * unit, size[0]), min(y1 * unit, size[1])
+    return Crop(None if kept < _MIN_KEPT else box, kept)
 
 
 def crop_rows(covered: BoolArray, factor: int, size: tuple[int, int], whole: Box) -> Crop:
@@ -63,9 +62,8 @@ def crop_rows(covered: BoolArray, factor: int, size: tuple[int, int], whole: Box
     # A reduced pixel stands for those around its centre: one row less on each side makes sure of all of them.
     first, last = first + (first > 0), last - (last < len(covered))
     kept = max(0, int(last - first)) * covered.shape[1] / max(1, int(covered.sum()))
-    if kept < _MIN_KEPT:
-        return Crop(None, kept)
-    return Crop((whole[0], int(first) * factor, whole[2], min(int(last) * factor, size[1])), kept)
+    box = whole[0], int(first) * factor, whole[2], min(int(last) * factor, size[1])
+    return Crop(None if kept < _MIN_KEPT else box, kept)
 
 
 def largest_rectangle(cells: BoolArray) -> Box:

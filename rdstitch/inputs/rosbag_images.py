@@ -1,10 +1,10 @@
 """Images of a ROS bag, as image files with time stamps."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import cv2
 import numpy as np
@@ -43,59 +43,51 @@ def extract_images(
 ) -> tuple[list[Frame], FrameSelection]:
     """Write images of a topic to a folder, losslessly, with number and time stamp (s) of the header."""
     with opened_bag(path) as reader:
-        messages = _Messages.of(reader, path, topic)
-        wanted = wanted_frames(every, messages.grey)
-        return list(messages.frames(folder, wanted)), wanted
+        wanted = wanted_frames(every, partial(_grey, path, reader, topic))
+        return list(_frames(path, reader, topic, folder, wanted)), wanted
 
 
 def images_in_bag(path: Path, folder: Path, every: int, topic: str | None = None) -> Iterator[Frame]:
     """Write every n-th image of a topic to a folder, one after the other, as :func:`extract_images` does."""
     with opened_bag(path) as reader:
-        yield from _Messages.of(reader, path, topic).frames(folder, FrameSelection(every))
+        yield from _frames(path, reader, topic, folder, FrameSelection(every))
 
 
-@dataclass(frozen=True)
-class _Messages:
-    """The images of one topic."""
+def _messages(path: Path, reader: Any, topic: str | None) -> Iterator[tuple[Any, int, bytes]]:
+    """Connection, time (ns) and content of the images of a topic, or of the only one that has images."""
+    chosen = chosen_topic(path, reader, topic)
+    images = [c for c in reader.connections if c.topic == chosen and c.msgtype in IMAGE_TYPES]
+    yield from reader.messages(connections=images)
 
-    reader: Any
-    connections: list[Any]
-    path: Path
 
-    @classmethod
-    def of(cls, reader: Any, path: Path, topic: str | None) -> Self:
-        """The images of a topic, or of the only one that has images."""
-        chosen = chosen_topic(path, reader, topic)
-        images = [c for c in reader.connections if c.topic == chosen and c.msgtype in IMAGE_TYPES]
-        return cls(reader, images, path)
+def _grey(path: Path, reader: Any, topic: str | None) -> Iterator[UInt8Array | None]:
+    """All images, (H, W), 8 bits; None where one cannot be decoded."""
+    for connection, _, data in _messages(path, reader, topic):
+        message = reader.deserialize(data, connection.msgtype)
+        compressed = connection.msgtype == COMPRESSED
+        pixels = _grey_of_compressed(message.data) if compressed else _pixels(path, message)
+        if pixels is not None and pixels.ndim == 3:
+            pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY))
+        yield None if pixels is None else _eight_bits(pixels)
 
-    def grey(self) -> Iterator[UInt8Array | None]:
-        """All of them, (H, W), 8 bits; None where one cannot be decoded."""
-        for connection, _, data in self.reader.messages(connections=self.connections):
-            message = self.reader.deserialize(data, connection.msgtype)
-            compressed = connection.msgtype == COMPRESSED
-            pixels = _grey_of_compressed(message.data) if compressed else _pixels(self.path, message)
-            if pixels is not None and pixels.ndim == 3:
-                pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY))
-            yield None if pixels is None else _eight_bits(pixels)
 
-    def frames(self, folder: Path, wanted: FrameSelection) -> Iterator[Frame]:
-        """The wanted images, written to a folder."""
-        for number, (connection, time_ns, data) in enumerate(self.reader.messages(connections=self.connections)):
-            if number not in wanted:
-                continue
-            message = self.reader.deserialize(data, connection.msgtype)
-            stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
-            name = f"{self.path.stem}_{number:06d}"
-            if connection.msgtype == COMPRESSED:
-                # By its first bytes: the format field is free text.
-                suffix = ".png" if bytes(message.data[:4]) == b"\x89PNG" else ".jpg"
-                file = folder / f"{name}{suffix}"
-                file.write_bytes(message.data.tobytes())
-            else:
-                file = write_frame(folder / f"{name}.png", _pixels(self.path, message))
-            # Drivers that do not set the stamp leave it 0; the recorder's time is then the best that is known.
-            yield Frame(file, number, stamp or time_ns * 1e-9)
+def _frames(path: Path, reader: Any, topic: str | None, folder: Path, wanted: FrameSelection) -> Iterator[Frame]:
+    """The wanted images, written to a folder."""
+    for number, (connection, time_ns, data) in enumerate(_messages(path, reader, topic)):
+        if number not in wanted:
+            continue
+        message = reader.deserialize(data, connection.msgtype)
+        stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+        name = f"{path.stem}_{number:06d}"
+        if connection.msgtype == COMPRESSED:
+            # By its first bytes: the format field is free text.
+            suffix = ".png" if bytes(message.data[:4]) == b"\x89PNG" else ".jpg"
+            file = folder / f"{name}{suffix}"
+            file.write_bytes(message.data.tobytes())
+        else:
+            file = write_frame(folder / f"{name}.png", _pixels(path, message))
+        # Drivers that do not set the stamp leave it 0; the recorder's time is then the best that is known.
+        yield Frame(file, number, stamp or time_ns * 1e-9)
 
 
 def _eight_bits(grey: AnyArray) -> UInt8Array:
