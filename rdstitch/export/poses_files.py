@@ -21,6 +21,7 @@ from rdstitch.export.trajectory_files import as_csv
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rigid_in_plane, rotation_from_tilt
 from rdstitch.georeferencing.georeference import Georeference
+from rdstitch.inputs.frame import frame_numbers
 from rdstitch.inputs.times import timestamps_of
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.late_imports import spatial
@@ -40,7 +41,7 @@ def poses_table(result: StitchResult, frame: PosesFrame = "enu", height: float =
         poses, to_map, place = _poses_and_map(result, "leave out --frame map")
         path = Trajectory.on_map(poses, to_map, place.map_scale)
     sources = registration.sources
-    numbers = [source.number(k) for k, source in enumerate(sources)]
+    numbers = frame_numbers([source.frame for source in sources])
     path = path.labelled([source.name for source in sources], numbers, timestamps_of(sources))
     return as_csv(path, "enu" if frame == "map" else frame)
 

@@ -54,9 +54,9 @@ class Frame:
         return self.image.load() if isinstance(self.image, DeferredImage) else self.image
 
 
-def frame_numbers(listed: Sequence[Frame]) -> list[int]:
+def frame_numbers(listed: Sequence[Frame | None]) -> list[int]:
     """The number of each in its video, bag or list of arrays, else its place among all that are listed."""
-    return [place if frame.number is None else frame.number for place, frame in enumerate(listed)]
+    return [place if frame is None or frame.number is None else frame.number for place, frame in enumerate(listed)]
 
 
 Image = str | os.PathLike[str] | AnyArray | PIL.Image.Image

@@ -79,10 +79,6 @@ class Source:
         x, y, z = rotation_from_tilt(self.attitude.tilt)[:, 2].tolist()
         return x, y, z
 
-    def number(self, position: int) -> int:
-        """Its number in the video or bag that it was taken from, else its position in the sequence."""
-        return position if self._frame.number is None else self._frame.number
-
     def with_absolute_paths(self) -> Self:
         """The source with absolute paths, for workers elsewhere, where relative ones begin at other folders."""
         mask = None if self.mask is None else replace(self.mask, path=self.mask.path.absolute())
