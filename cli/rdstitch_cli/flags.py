@@ -32,7 +32,12 @@ def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callab
     def make(function: Callable[..., Any]) -> click.Command:
         @wraps(function)
         def run(*, quiet: bool, verbose: bool, **given: Any) -> Any:
-            _check_configuration_is_kept(flags, given)
+            # Of the configuration, over which nothing may be written, the library knows nothing.
+            if configuration := click.get_current_context().meta.get(CONFIG_FILE):
+                from rdstitch.system.output_checks import check_not_read
+
+                written = [given[str(flag.name)] for flag in flags if flag.declared.file is FileUse.WRITTEN]
+                check_not_read([path for path in written if path is not None], [configuration])
             try:
                 with Reporter(verbose - quiet) as reporter:
                     return function(reporter=reporter, **given)
@@ -132,15 +137,6 @@ class Flag(click.Option):
     def __init__(self, *arguments: Any, declared: Option, **given: Any) -> None:
         super().__init__(*arguments, **given)
         self.declared = declared
-
-
-def _check_configuration_is_kept(flags: Iterable[Flag], given: Mapping[str, Any]) -> None:
-    """Refuse to write over the configuration, of which the library knows nothing."""
-    if configuration := click.get_current_context().meta.get(CONFIG_FILE):
-        from rdstitch.system.output_checks import check_not_read
-
-        written = [given[str(flag.name)] for flag in flags if flag.declared.file is FileUse.WRITTEN]
-        check_not_read([path for path in written if path is not None], [configuration])
 
 
 class FilePath(click.Path):

@@ -144,17 +144,16 @@ def plan_warp(
 
 
 def _measured(draft: Warp, probes: FloatArray, canvas: Canvas) -> Warp:
-    """The warp with its box, and with the spacing and the shrinkage at canvas pixels all over the image."""
-    draft = replace(draft, shrink=_shrink(draft, probes))
-    return replace(draft, box=_reached(draft, canvas), step=_lattice_step(draft, probes))
+    """The warp with the spacing and the shrinkage at canvas pixels all over the image, and with room in its box.
 
-
-def _reached(warp: Warp, canvas: Canvas) -> Box:
-    """The warp's box with room for what a displacement moves beyond it."""
+    That is for what a displacement moves beyond it.
+    """
+    warp = replace(draft, shrink=_shrink(draft, probes))
+    warp, box = replace(warp, step=_lattice_step(warp, probes)), warp.box
     if warp.displacement is None:
-        return warp.box
+        return warp
     moved = np.abs(warp.displacement(warp.camera.outline(_PROBES))).max() / warp.shrink
-    return intersection(grown(warp.box, int(np.ceil(moved)) + 1), (0, 0, *canvas.size)) or warp.box
+    return replace(warp, box=intersection(grown(box, int(np.ceil(moved)) + 1), (0, 0, *canvas.size)) or box)
 
 
 def plan_warps(images: Sequence[PlacedImage], canvas: Canvas) -> list[Warp]:

@@ -18,7 +18,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.choices import PosesFrame
 from rdstitch.errors import ArgumentError
 from rdstitch.export.trajectory_files import as_csv
-from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rigid_in_plane, rotation_from_tilt
 from rdstitch.georeferencing.georeference import Georeference
 from rdstitch.inputs.frame import frame_numbers
@@ -71,7 +70,8 @@ def poses_file(result: StitchResult, file: str | Path, frame: PosesFrame = "enu"
         return _geo_of_opendronemap(result)
     if poses is None:
         raise ArgumentError(f"{file}: one homography per image has no poses; --model pose gives some")
-    if len({_lens(camera) for camera in result.placed.cameras}) > 1:
+    lenses = {(c.image_size, c.center, c.focal, c.coefficients, c.lens_model) for c in result.placed.cameras}
+    if len(lenses) > 1:
         raise ArgumentError(f"{file}: the images are of several cameras or sizes, and there they have the same one")
     to_map = None if result.georeference is None else _poses_and_map(result, "leave out --straighten")[1]
     return _images_of_colmap([source.name for source in result.registration.sources], poses, to_map)
@@ -92,11 +92,6 @@ def _geo_of_opendronemap(result: StitchResult) -> str:
         if np.isfinite(centre).all()
     ]
     return "\n".join([f"EPSG:{place.crs.epsg}", *rows]) + "\n"
-
-
-def _lens(camera: Camera) -> tuple[object, ...]:
-    """What a camera of COLMAP has."""
-    return camera.image_size, camera.center, camera.focal, camera.coefficients, camera.lens_model
 
 
 def _images_of_colmap(names: Sequence[str], poses: PlanarPoses, to_map: FloatArray | None) -> str:

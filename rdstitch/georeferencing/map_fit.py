@@ -72,14 +72,13 @@ class Measured:
 def fit_map(views: Views, measured: Measured) -> MapFit:
     """Fit measured places; the ground is level unless they clearly show that it slopes."""
     level = _fitted(views, measured, 0.0)
-    if level is None or not _has_altitudes(views, measured.altitude).any():
-        return level or _no_fit(len(measured.places))
+    if level is None:
+        count = len(measured.places)
+        return MapFit(0.0, 0.0, np.full(count, complex(np.inf)), np.zeros(count, dtype=bool), None)
+    if not _has_altitudes(views, measured.altitude).any():
+        return level
     sloping = _fitted(views, measured, SLOPE_STD)
     return sloping if sloping is not None and sloping.slope_squared > _SHOWN**2 else level
-
-
-def _no_fit(count: int) -> MapFit:
-    return MapFit(0.0, 0.0, np.full(count, complex(np.inf)), np.zeros(count, dtype=bool), None)
 
 
 def _fitted(views: Views, measured: Measured, slope_std: float) -> MapFit | None:

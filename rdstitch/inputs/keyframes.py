@@ -59,7 +59,9 @@ def tracked(frames: Iterable[UInt8Array]) -> FramePlaces:
     track: list[int] = []
     size, flow, begun_at = (1, 1), CornerFlow(), np.eye(3)
     for frame in frames:
-        small = _small(frame)
+        small, factor = frame, _SIDE / max(frame.shape)
+        if factor < 1.0:
+            small = np.asarray(cv2.resize(frame, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
         size = small.shape[1], small.shape[0]
         image = PreparedImage(small, None, np.ones(2), size)
         matched = flow.follow(image)
@@ -95,14 +97,6 @@ def fitted_affine(target: FloatArray, source: FloatArray, threshold: float) -> t
         return None, inliers
     inliers[known] = agree[:, 0] > 0
     return np.asarray(motion, dtype=np.float64), inliers
-
-
-def _small(frame: UInt8Array) -> UInt8Array:
-    """A frame no longer than ``_SIDE``."""
-    factor = _SIDE / max(frame.shape)
-    if factor >= 1.0:
-        return frame
-    return np.asarray(cv2.resize(frame, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 @dataclass(frozen=True)

@@ -196,10 +196,8 @@ def as_image(file: Path, samples: AnyArray, alpha: AnyArray | None, metadata: Me
         valid = finite if samples.ndim == 2 else finite.all(axis=2)
         if not valid.all():
             samples = np.where(finite, samples, np.float32(0.0))
-            whole = np.full(valid.shape, OPAQUE, np.uint8) if opaque is None else opaque
-            opaque = np.where(valid, whole, np.uint8(0))
-    if opaque is not None and bool((opaque == OPAQUE).all()):
-        opaque = None
+            opaque = np.where(valid, np.uint8(OPAQUE) if opaque is None else opaque, np.uint8(0))
     if opaque is not None:
-        opaque = np.ascontiguousarray(turned(opaque, metadata.orientation))
+        whole = bool((opaque == OPAQUE).all())
+        opaque = None if whole else np.ascontiguousarray(turned(opaque, metadata.orientation))
     return DecodedImage(np.ascontiguousarray(turned(samples, metadata.orientation)), opaque, metadata)

@@ -30,12 +30,12 @@ def jpeg_pieces(spec: ImageSpec, strips: Iterable[Strip], workers: int = 1) -> I
     """The pieces of a JPEG file, three strips in memory at a time; transparency becomes the background."""
     first = True
     for data in _encoded(spec, strips, workers):
-        head, scan = _header_and_scan(data)
+        scan = _segment_end(data, _segment_of(data, _START_OF_SCAN))
         if first:
-            yield from _embedded(_with_height(head, spec.size[1]), spec.metadata)
+            yield from _embedded(_with_height(data[:scan], spec.size[1]), spec.metadata)
         else:
             yield _RESTART_7
-        yield scan
+        yield memoryview(data)[scan : -len(_END_OF_IMAGE)]
         first = False
     yield _END_OF_IMAGE
 
@@ -69,12 +69,6 @@ def _jpeg(spec: ImageSpec, samples: AnyArray, alpha: UInt8Array | None) -> bytes
     if not done:
         raise LimitError(f"{spec.size[0]} x {spec.size[1]} pixels cannot be encoded as JPEG; write a .tif")
     return np.asarray(data, dtype=np.uint8).tobytes()
-
-
-def _header_and_scan(data: bytes) -> tuple[bytes, memoryview]:
-    """Everything up to the scan, and the scan without the end marker."""
-    position = _segment_end(data, _segment_of(data, _START_OF_SCAN))
-    return data[:position], memoryview(data)[position : -len(_END_OF_IMAGE)]
 
 
 def _with_height(head: bytes, height: int) -> bytes:
