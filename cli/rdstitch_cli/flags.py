@@ -13,6 +13,7 @@ from typing import Annotated, Any, ForwardRef, get_args, get_origin
 import click
 from click.core import ParameterSource
 
+from rdstitch.errors import ArgumentError
 from rdstitch.options.option import Declared, FileUse, Option, Unit, declaration, declared
 from rdstitch_cli.config import CONFIG_FILE, config
 from rdstitch_cli.help_pages import EXIT_STATUSES, GroupedCommand
@@ -177,10 +178,9 @@ class EnteredValue(click.ParamType):  # type: ignore[type-arg]  # generic since 
         if value and value == self.entry.option.none:
             return None
         for kind in self.entry.types:
-            with suppress(ValueError, OverflowError):
-                parsed = self._parsed(value, kind)
-                if self.entry.fits(parsed):
-                    return self._in_radians(parsed) if self.entry.option.unit is Unit.DEGREES else parsed
+            with suppress(ValueError, OverflowError, ArgumentError):
+                parsed = self.entry.taken(self._parsed(value, kind))
+                return self._in_radians(parsed) if self.entry.option.unit is Unit.DEGREES else parsed
         expected = self.entry.expected
         if self.entry.option.unit is Unit.BYTES:
             expected = "an amount of memory such as 800M or 2G"
