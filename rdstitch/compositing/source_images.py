@@ -26,7 +26,7 @@ _PIXELS_PER_OUTPUT_PIXEL = 1.9
 _PROBE_REDUCTION = 8  # at which an image is read only to learn its samples and whether it is masked
 
 ImageLoader = Callable[[int], DecodedImage]
-"""Reads an image reduced by a factor, of which large ones are quicker; see :func:`rdstitch.io.read_image`."""
+"""Reads an image reduced by a factor, of which large ones are quicker; see :func:`rdstitch.io.read.read_image`."""
 
 Displacement = Callable[[FloatArray], FloatArray]
 """Displacement of an image's content, pixels (..., 2), at measured pixels (..., 2): what local alignment found."""

@@ -15,7 +15,8 @@ from rdstitch.export.trajectory_files import path_as_svg, write_trajectory
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
 from rdstitch.inputs.rosbag import opened_bag
-from rdstitch.io import read_image, write_image
+from rdstitch.io.read import read_image
+from rdstitch.io.write import write_image
 from rdstitch.results.pose import FollowedPoses, Pose
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs

@@ -20,9 +20,9 @@ from rdstitch.inputs.find import find_images
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io import DecodedImage, read_image
 from rdstitch.io.mask import Mask, mask_frame
 from rdstitch.io.metadata import Metadata
+from rdstitch.io.read import DecodedImage, read_image
 from rdstitch.pipeline.registration.image_circle import with_image_circle
 from rdstitch.synthetic import FisheyeLens, grid_poses, ground, sequence_over
 from rdstitch.system.cache import Cache

@@ -20,10 +20,11 @@ from PIL.PngImagePlugin import PngInfo
 from rdstitch.errors import InputError
 from rdstitch.inputs.find import find_images
 from rdstitch.io import read as reading
-from rdstitch.io import read_image, read_metadata, write_image
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
-from rdstitch.io.metadata import MAX_PROFILE
+from rdstitch.io.metadata import MAX_PROFILE, read_metadata
 from rdstitch.io.opening import MAX_IMAGE_GB
+from rdstitch.io.read import read_image
+from rdstitch.io.write import write_image
 from rdstitch.system.file_access import open_regular, read_beginning, read_limited, read_text
 
 _RGB = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
