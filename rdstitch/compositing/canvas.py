@@ -227,7 +227,6 @@ def _resolution(camera: Camera, matrix: FloatArray) -> float:
 
 
 def _refuse_mirrored(px_per_unit: FloatArray, names: Sequence[str]) -> None:
-    """Refuse an image that lies mirrored among the others."""
     usual = 1.0 if (px_per_unit > 0).sum() * 2 >= len(px_per_unit) else -1.0
     for value, name in zip(px_per_unit, names, strict=True):
         if value * usual < 0:

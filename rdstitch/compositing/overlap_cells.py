@@ -83,7 +83,6 @@ def compare_overlaps(survey: Survey, workers: int = 1) -> Cells | None:
     overlap_fractions, cells = np.zeros(len(pairs)), list[tuple[IntArray, FloatArray, FloatArray]]()
 
     def compared(first: int) -> list[tuple[IntArray, FloatArray, FloatArray]]:
-        """The cells of some pairs."""
         of_pairs = []
         for index, (i, j) in enumerate(pairs[first : first + _PAIRS_AT_A_TIME].tolist(), start=first):
             box, seen = survey.overlap(i, j)

@@ -186,7 +186,6 @@ class Renderer:
         return self._as_samples(cut(blender.result(), outer, box))
 
     def _as_samples(self, values: Float32Array) -> AnyArray:
-        """Values in the output's type, rounded where it is whole numbers."""
         if self.dtype.kind != "u":
             return values.astype(self.dtype)
         return np.clip(np.rint(values), 0, np.float32(full_scale(self.dtype))).astype(self.dtype)
@@ -199,7 +198,6 @@ class Renderer:
         return self.exposure.correct(layer.index, geometry, pixels.reshape(*geometry.shape, self.channels))
 
     def _layers(self, box: Box) -> list[Layer]:
-        """Weights of all images that contribute to a box."""
         if self.seams is None and self.options.blend != "none":
             return list(self._bordered(box))
         return self._owned(box)

@@ -25,8 +25,6 @@ from rdstitch.options.composite_options import CompositeOptions
 
 @dataclass(frozen=True, eq=False)
 class _Share:
-    """What one image gives to a box of the output."""
-
     index: int
     box: Box
     places: tuple[NDArray[np.int16], NDArray[np.uint16]]

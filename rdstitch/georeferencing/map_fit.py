@@ -121,8 +121,6 @@ class _Trust(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """A solution of the equations."""
-
     solution: FloatArray  # (P,)
     covariance: FloatArray  # (P, P)
     residual: FloatArray  # (N, 3): east, north, altitude

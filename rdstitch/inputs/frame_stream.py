@@ -92,7 +92,6 @@ def _of_names(names: IO[str], idle: float | None, kept: list[Named]) -> Iterator
 
 
 def _read_lines(stream: IO[str], read: "queue.Queue[str | None]") -> None:
-    """Hand on the lines of a stream, and None at its end."""
     try:
         # As bytes where there are any: names of files need not be UTF-8.
         for line in getattr(stream, "buffer", stream):

@@ -151,7 +151,6 @@ def _listed_fields(line: str) -> list[str]:
 
 
 def _by_rows(rows: Sequence[Row | None], file: str, system: NamedSystem | None) -> list[GpsPosition | None]:
-    """Positions by rows."""
     places: list[GpsPosition | None] = []
     coordinates = [None if row is None else coordinates_of(row) for row in rows]
     degrees = iter(geographic_places([each for each in coordinates if each is not None], file, system))

@@ -185,7 +185,6 @@ def _grey(path: Path, reader: Any, topic: str | None) -> Iterator[UInt8Array | N
 
 
 def _frames(path: Path, reader: Any, topic: str | None, folder: Path, wanted: FrameSelection) -> Iterator[Frame]:
-    """The wanted images, written to a folder."""
     for number, (connection, time_ns, data) in enumerate(_messages(path, reader, topic)):
         if number not in wanted:
             continue

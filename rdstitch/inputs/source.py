@@ -125,7 +125,6 @@ class Source:
         return View(image.pixels, image.alpha, reduction, self.camera.image_size)
 
     def _load(self, reduction: int) -> DecodedImage:
-        """Read the pixels, corrected and masked."""
         if self._frame.image is None:
             with held_in_memory(self.path), self.guard.reading(self.path):
                 image = read_image(self.path, reduction, self.metadata)

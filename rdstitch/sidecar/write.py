@@ -152,7 +152,6 @@ def _with_errors_of(registered: CameraRecord, camera: Camera) -> CameraRecord:
 
 
 def _used_image(result: Recomposition, index: int, position: int, *, same_lens: bool) -> ImageRecord:
-    """The record of a registered image, with the one that took its place."""
     image, source = result.saved.images[index], result.placed.sources[position]
     original = result.saved.original(image)
     is_original = original is not None and original.resolve() == source.path.resolve()
