@@ -55,15 +55,10 @@ class VisibleRegion:
     def masked(self, image: DecodedImage) -> DecodedImage:
         """The image, whole or reduced, with the rest transparent."""
         height, width = image.pixels.shape[:2]
-        shown = self._shown(width, height)
-        alpha = np.where(shown, np.uint8(255) if image.alpha is None else image.alpha, np.uint8(0))
-        return replace(image, alpha=alpha)
-
-    def _shown(self, width: int, height: int) -> BoolArray:
-        """Which pixels of the image at a size are drawn; in measured coordinates the limit is a conic."""
         camera = self.camera.resized((width, height))
         x = (np.arange(width) - camera.center[0]) / camera.scale
         shown = np.empty((height, width), dtype=np.bool_)
+        # In measured coordinates the limit is a conic.
         for top in range(0, height, _ROWS):
             y = ((np.arange(top, min(top + _ROWS, height)) - camera.center[1]) / camera.scale)[:, None]
             radius2 = x**2 + y**2
@@ -72,7 +67,7 @@ class VisibleRegion:
                 lens *= radius2
                 lens += coefficient
             shown[top : top + _ROWS] = self.depth[0] * x + self.depth[1] * y + self.depth[2] * lens > 0.0
-        return shown
+        return replace(image, alpha=np.where(shown, np.uint8(255) if image.alpha is None else image.alpha, np.uint8(0)))
 
     def _value(self, flat: FloatArray) -> FloatArray:
         """What is positive where undistorted points (K, 2) are drawn."""

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from rdstitch.arrays import AnyArray, BoolArray, Float32Array, FloatArray
 from rdstitch.errors import ArgumentError, OutputError
+from rdstitch.io.write import write_image
 from rdstitch.synthetic.lenses import Lens
 from rdstitch.synthetic.poses import Poses, fit_to_plane, pixels_of_texels, plane_outline, texels_of_pixels
 from rdstitch.synthetic.relief import NOWHERE, Relief
@@ -135,18 +136,9 @@ class RenderedSequence:
         paths = []
         for index in range(len(self)):
             path = Path(folder) / name.format(index)
-            image = self.frame(index)
-            bgr = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
-            eight_only = image.dtype == np.uint16 and path.suffix.lower() not in _SIXTEEN_BITS
-            if eight_only or not cv2.haveImageWriter(path.name):
+            if self.photometry.bits > 8 and path.suffix.lower() not in _SIXTEEN_BITS:
                 raise OutputError(f"{path}: cannot hold images of {self.photometry.bits} bits; use .png or .tif")
-            encodes, encoded = cv2.imencode(path.suffix, bgr)
-            if not encodes:
-                raise OutputError(f"{path}: OpenCV cannot encode it")
-            try:
-                path.write_bytes(encoded.tobytes())
-            except OSError as error:
-                raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+            write_image(path, self.frame(index))
             paths.append(path)
         return paths
 
