@@ -20,12 +20,11 @@ from rdstitch.io.deepzoom import write_deep_zoom
 from rdstitch.io.fingerprint import Fingerprint, fingerprint
 from rdstitch.io.formats import check_format
 from rdstitch.io.metadata import Metadata
-from rdstitch.io.ome_tiff import OME_SUFFIXES, write_ome_tiff
-from rdstitch.io.ome_zarr import write_ome_zarr
 from rdstitch.io.samples import OPAQUE
 from rdstitch.io.strips import STRIP_ROWS, ImageSpec, Strip, as_eight_bit, check_strips
 from rdstitch.io.tiff import ExtraTag, write_tiff
 from rdstitch.io.write_jpeg import jpeg_pieces
+from rdstitch.io.write_ome import OME_SUFFIXES, write_ome_tiff, write_ome_zarr
 from rdstitch.io.write_png import png_pieces
 from rdstitch.results.messages import Message
 from rdstitch.system.output_checks import check_folder, is_zarr, naming, tiles_folder
