@@ -179,10 +179,9 @@ def test_raw_files(tmp_path: Path) -> None:
 def test_the_focal_length_of_a_raw_file_holds_for_its_image_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]
 ) -> None:
-    """Its tags count pixels of the sensor, however the camera was held."""
+    """Its tags count pixels of the sensor, however the camera was held; and of a camera without a name too."""
     tag = ExifTags.Base
     exif = Image.Exif()
-    exif[tag.Model] = "Camera"
     photo: dict[int, float] = {tag.FocalLength: 50.0, tag.FocalPlaneXResolution: 4000.0}
     exif.get_ifd(ExifTags.IFD.Exif).update(photo | {tag.ExifImageWidth: 6000, tag.ExifImageHeight: 4000})
     monkeypatch.setattr("rdstitch.io.metadata.raw_exif", lambda _: exif)
