@@ -13,7 +13,7 @@ import numpy as np
 from rdstitch.arrays import UInt8Array
 from rdstitch.errors import InputError, OutputError
 from rdstitch.io.opening import check_readable
-from rdstitch.system.opencv_state import silent_opencv
+from rdstitch.system.native_threads import silent_opencv
 
 _FFMPEG_LEVEL, _FFMPEG_QUIET = "OPENCV_FFMPEG_LOGLEVEL", "-8"
 _ffmpeg_unloaded = Lock()  # until the first video of the process
