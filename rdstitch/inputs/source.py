@@ -212,9 +212,7 @@ def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, dist
         known = known.with_focal(focal, "option")
     elif known.focal_source in (None, "guess") and metadata.focal_px is not None:
         known = known.with_focal(metadata.focal_px, "exif")
-    if distortion is None:
-        return known
-    return known.with_coefficients(distortion)
+    return known if distortion is None else known.with_coefficients(distortion)
 
 
 def _fitted(camera: Camera, metadata: Metadata) -> Camera:

@@ -45,12 +45,12 @@ def _srgb_of_lab(lab: AnyArray, *, signed: bool) -> FloatArray:
     return np.asarray(np.rint(gamma * full))
 
 
-def ink_transform(profile: bytes) -> "ImageCms.ImageCmsTransform | None":
-    """What a colour profile of inks (CMYK) makes of them in sRGB; None where it cannot be used."""
+def transform_to_srgb(profile: bytes, mode: str = "CMYK") -> "ImageCms.ImageCmsTransform | None":
+    """What a colour profile, of inks (CMYK) or others, makes of samples in sRGB; None where it cannot be used."""
     from PIL import ImageCms
 
     try:
-        return ImageCms.buildTransform(io.BytesIO(profile), ImageCms.createProfile("sRGB"), "CMYK", "RGB")
+        return ImageCms.buildTransform(io.BytesIO(profile), ImageCms.createProfile("sRGB"), mode, "RGB")
     except (ImageCms.PyCMSError, ImportError):
         return None
 
@@ -58,7 +58,7 @@ def ink_transform(profile: bytes) -> "ImageCms.ImageCmsTransform | None":
 def without_inks(image: Image.Image) -> Image.Image:
     """An image of inks in sRGB, by its colour profile where it has one; any other as it is."""
     profile = image.info.get("icc_profile")
-    transform = ink_transform(profile) if image.mode == "CMYK" and isinstance(profile, bytes) else None
+    transform = transform_to_srgb(profile) if image.mode == "CMYK" and isinstance(profile, bytes) else None
     if transform is None:
         return image
     from PIL import ImageCms
@@ -75,11 +75,9 @@ def colour_space(profile: bytes) -> bytes:
 @lru_cache(maxsize=16)
 def _is_linear(profile: bytes) -> bool:
     """Whether samples are proportional to light, as those of "linear sRGB" are: middle grey is 188 in sRGB then."""
+    if (to_srgb := transform_to_srgb(profile, "RGB")) is None:
+        return False
     from PIL import ImageCms
 
-    try:
-        to_srgb = ImageCms.buildTransform(io.BytesIO(profile), ImageCms.createProfile("sRGB"), "RGB", "RGB")
-    except (ImageCms.PyCMSError, ImportError):
-        return False
     grey = ImageCms.applyTransform(Image.new("RGB", (1, 1), (128, 128, 128)), to_srgb)
     return bool(np.asarray(grey).mean() > (128 + 188) / 2)

@@ -48,14 +48,14 @@ def read_flat_field(file: str | Path, size: tuple[int, int], channels: int) -> F
     check_readable(path)
     with decoding(path), tifffile.TiffFile(path) as tiff:
         pages = [np.asarray(page.asarray(), dtype=np.float32) for page in islice(image_pages(tiff), 2)]
-    for number, page in enumerate(pages, 1):
-        if page.shape[:2] != size[::-1]:
-            has = f"page {number} has {page.shape[1]} x {page.shape[0]} pixels"
-            raise InputError(f"{file}: {has}, but the tiles {size[0]} x {size[1]}")
     planes = [page.reshape(*page.shape[:2], -1) for page in pages]
     for number, plane in enumerate(planes, 1):
-        if plane.shape[2] not in (1, channels):
-            raise InputError(f"{file}: page {number} has {plane.shape[2]} channels, but the tiles {channels}")
+        height, width, bands = plane.shape
+        if (width, height) != size:
+            has = f"page {number} has {width} x {height} pixels"
+            raise InputError(f"{file}: {has}, but the tiles {size[0]} x {size[1]}")
+        if bands not in (1, channels):
+            raise InputError(f"{file}: page {number} has {bands} channels, but the tiles {channels}")
         if not np.isfinite(plane).all():
             raise InputError(f"{file}: page {number} has values that are not finite")
     gain = planes[0]
