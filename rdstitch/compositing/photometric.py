@@ -86,10 +86,7 @@ class Exposure:
     def factors(self, index: int, geometry: Geometry) -> Float32Array:
         """What samples of image ``index`` are multiplied by, (h, w, C), before highlights are compressed."""
         gain = np.exp(-self.log_gain[index]).astype(np.float32)
-        if not (self.vignetting.any() or self.fields.size):
-            return np.broadcast_to(gain, (*geometry.shape, len(gain)))
-        nodes = self._smooth_nodes(index, geometry) * gain
-        return _joined(_planes(nodes, geometry))
+        return _joined(_planes(self._smooth_nodes(index, geometry) * gain, geometry))
 
     def _apply(self, pixels: AnyArray, factors: list[Any], rates: list[Any]) -> AnyArray:
         """``q (v + b) - b``, compressed above the knee; one array for all channels, or one plane a channel."""
