@@ -127,10 +127,6 @@ class Canvas:
             wanted = wanted[0] - x0, wanted[1] - y0, wanted[2] - x0, wanted[3] - y0
         return replace(self._changed(shift, (x1 - x0, y1 - y0)), cropped_to=wanted)
 
-    def widened(self, margin: int) -> "Canvas":
-        """The same with ``margin`` pixels more on the left and on the right."""
-        return self.cropped((-margin, 0, self.size[0] + margin, self.size[1]))
-
     def reduced(self, factor: int) -> "Canvas":
         """The same canvas with pixels ``factor`` times as large."""
         width, height = (-(-n // factor) for n in self.size)
