@@ -36,8 +36,7 @@ def image_pages(tiff: "tifffile.TiffFile") -> Iterator["tifffile.TiffPage"]:
     """The pages of a file that are images of their own; the first page always is."""
     yield tiff.pages.first
     for number in range(1, len(tiff.pages)):  # which goes through the whole file
-        page = tiff.pages[number]
-        page = page if isinstance(page, tifffile.TiffPage) else page.aspage()
+        page = tiff.pages[number].aspage()
         if not (page.is_reduced or page.is_mask):
             yield page
 

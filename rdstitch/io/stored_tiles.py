@@ -83,8 +83,7 @@ class StoredTile:
         """Width and height, bits and samples of a pixel, by the header of the first page."""
         page = self.planes[min(self.planes)]
         with decoding(page.file), open_regular(page.file) as stream, _tiff(stream, page.file) as tiff:
-            first = tiff.pages[page.number if page.number < len(tiff.pages) else 0]
-            assert isinstance(first, tifffile.TiffPage)
+            first = tiff.pages[page.number if page.number < len(tiff.pages) else 0].aspage()
             return (first.imagewidth, first.imagelength), int(first.bitspersample), int(first.samplesperpixel)
 
 
@@ -94,8 +93,7 @@ def _tiff(stream: Any, file: Path) -> "tifffile.TiffFile":
 
 def _samples(tiff: "tifffile.TiffFile", number: int) -> tuple[AnyArray, UInt8Array | None]:
     if number < len(tiff.pages):
-        page = tiff.pages[number]
-        return read_page(tiff, page if isinstance(page, tifffile.TiffPage) else page.aspage())
+        return read_page(tiff, tiff.pages[number].aspage())
     # ImageJ writes large stacks behind one directory.
     stack = tiff.series[0].asarray()
     return np.asarray(stack.reshape(-1, *stack.shape[-2:])[number]), None
@@ -217,7 +215,7 @@ def _ome_tile(
 
 def _micro_manager_tag(page: Any) -> dict[str, Any] | None:
     """What Micro-Manager wrote of a page."""
-    tag = (page if isinstance(page, tifffile.TiffPage) else page.aspage()).tags.get("MicroManagerMetadata")
+    tag = page.aspage().tags.get("MicroManagerMetadata")
     value = None if tag is None else tag.value
     with suppress(ValueError):
         value = json.loads(value) if isinstance(value, str | bytes) else value
