@@ -35,7 +35,10 @@ def joined(*content: Content) -> Markup:
 
 def element(name: str, *content: Content, **attributes: Any) -> Markup:
     """One element; ``stroke_width`` becomes ``stroke-width``, ``class_`` becomes ``class``."""
-    given = "".join(f' {key.rstrip("_").replace("_", "-")}="{_text(value)}"' for key, value in attributes.items())
+    texts = {
+        key: f"{value:.2f}" if isinstance(value, float) else escape(str(value)) for key, value in attributes.items()
+    }
+    given = "".join(f' {key.rstrip("_").replace("_", "-")}="{text}"' for key, text in texts.items())
     return Markup(f"<{name}{given}>" if name in _VOID else f"<{name}{given}>{joined(*content)}</{name}>")
 
 
@@ -91,12 +94,6 @@ def section(title: str, explanation: str, *content: Content) -> Markup:
     """A part of the page with its heading."""
     explained = element("p", explanation) if explanation else ""
     return element("section", element("h2", title), explained, *content)
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.2f}"
-    return escape(str(value))
 
 
 def of_source(source: Source, side: int) -> str | None:
