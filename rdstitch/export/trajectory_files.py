@@ -69,10 +69,10 @@ def path_as_svg(path: Trajectory, unit_name: str = "heights") -> str:
 """
 
 
-def frame_of(layout: str) -> TrajectoryFrame:
+def frame_of(file_format: str) -> TrajectoryFrame:
     """The frame of reference of a format where none is asked for: KITTI's axes are the camera's."""
     axes: dict[str, TrajectoryFrame] = {"kitti": "camera", "bag": "ros"}
-    return axes.get(layout, "enu")
+    return axes.get(file_format, "enu")
 
 
 def as_csv(path: Trajectory, frame: TrajectoryFrame) -> str:
