@@ -13,7 +13,7 @@ import numpy as np
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.features.prepared_image import PixelArray
-from rdstitch.io import write_image
+from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
 

@@ -8,9 +8,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.errors import ArgumentError
 
+AnyArray = NDArray[Any]
 BoolArray = NDArray[np.bool_]
+ComplexArray = NDArray[np.complex128]
+Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
+Int32Array = NDArray[np.int32]
 IntArray = NDArray[np.intp]
+UInt8Array = NDArray[np.uint8]
 
 
 def as_numbers(name: str, values: ArrayLike) -> FloatArray:
@@ -37,7 +42,7 @@ class Rows:
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
-    def take(self, rows: NDArray[Any]) -> Self:
+    def take(self, rows: AnyArray) -> Self:
         """The rows of some indices, in their order, or of a mask; copies."""
         columns = (getattr(self, name) for name in self.__dataclass_fields__)
         return type(self)(*(None if column is None else column[rows] for column in columns))
@@ -48,7 +53,7 @@ class Rows:
         columns = ([getattr(part, name) for part in parts] for name in cls.__dataclass_fields__)
         return cls(*(None if all(v is None for v in column) else np.concatenate(column) for column in columns))
 
-    def put(self, rows: NDArray[Any], others: Self) -> None:
+    def put(self, rows: AnyArray, others: Self) -> None:
         """Replace some rows."""
         for name in self.__dataclass_fields__:
             getattr(self, name)[rows] = getattr(others, name)

@@ -13,6 +13,7 @@ from typing import Annotated, Any, ForwardRef, get_args, get_origin
 import click
 from click.core import ParameterSource
 
+from rdstitch.errors import ArgumentError
 from rdstitch.options.option import Declared, FileUse, Option, Unit, declaration, declared
 from rdstitch_cli.config import CONFIG_FILE, config
 from rdstitch_cli.help_pages import EXIT_STATUSES, GroupedCommand
@@ -32,7 +33,12 @@ def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callab
     def make(function: Callable[..., Any]) -> click.Command:
         @wraps(function)
         def run(*, quiet: bool, verbose: bool, **given: Any) -> Any:
-            _check_configuration_is_kept(flags, given)
+            # Of the configuration, over which nothing may be written, the library knows nothing.
+            if configuration := click.get_current_context().meta.get(CONFIG_FILE):
+                from rdstitch.system.output_checks import check_not_read
+
+                written = [given[str(flag.name)] for flag in flags if flag.declared.file is FileUse.WRITTEN]
+                check_not_read([path for path in written if path is not None], [configuration])
             try:
                 with Reporter(verbose - quiet) as reporter:
                     return function(reporter=reporter, **given)
@@ -134,15 +140,6 @@ class Flag(click.Option):
         self.declared = declared
 
 
-def _check_configuration_is_kept(flags: Iterable[Flag], given: Mapping[str, Any]) -> None:
-    """Refuse to write over the configuration, of which the library knows nothing."""
-    if configuration := click.get_current_context().meta.get(CONFIG_FILE):
-        from rdstitch.system.output_checks import check_not_read
-
-        written = [given[str(flag.name)] for flag in flags if flag.declared.file is FileUse.WRITTEN]
-        check_not_read([path for path in written if path is not None], [configuration])
-
-
 class FilePath(click.Path):
     """A file or folder, which the library checks, or a word that stands for something else; ``./word`` is a file."""
 
@@ -181,10 +178,9 @@ class EnteredValue(click.ParamType):  # type: ignore[type-arg]  # generic since 
         if value and value == self.entry.option.none:
             return None
         for kind in self.entry.types:
-            with suppress(ValueError, OverflowError):
-                parsed = self._parsed(value, kind)
-                if self.entry.fits(parsed):
-                    return self._in_radians(parsed) if self.entry.option.unit is Unit.DEGREES else parsed
+            with suppress(ValueError, OverflowError, ArgumentError):
+                parsed = self.entry.taken(self._parsed(value, kind))
+                return self._in_radians(parsed) if self.entry.option.unit is Unit.DEGREES else parsed
         expected = self.entry.expected
         if self.entry.option.unit is Unit.BYTES:
             expected = "an amount of memory such as 800M or 2G"

@@ -89,7 +89,6 @@ def followed(
 
 
 def _print_poses(frames: Iterable["Pose"], reporter: Reporter) -> None:
-    """One line for each frame that arrives, until no more come."""
     read = True
     for frame in frames:
         if read:

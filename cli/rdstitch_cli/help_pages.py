@@ -49,7 +49,6 @@ _ALL = "rdstitch_cli.help_all"
 
 
 def _show_all(context: click.Context, _option: click.Parameter, wanted: bool) -> None:
-    """Print the page with all options, and end."""
     if wanted and not context.resilient_parsing:
         context.meta[_ALL] = True
         click.echo(context.get_help())

@@ -207,7 +207,6 @@ def _on_broken_pipe() -> int:
 
 
 def _cwd_is_deleted() -> bool:
-    """Check whether the current folder has been deleted, so that relative names lead nowhere."""
     try:
         Path.cwd()
     except FileNotFoundError:

@@ -31,7 +31,8 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.frame import DeferredImage, Frame
 from rdstitch.inputs.source import read_sources
-from rdstitch.io import DecodedImage, Metadata
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.read import DecodedImage
 from rdstitch.io.write import write_image
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.two_view import PairRegistration

@@ -37,7 +37,7 @@ from rdstitch.errors import RdstitchError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.crs import Crs
 from rdstitch.geometry.radial_homography import to_plane
-from rdstitch.io import read_image
+from rdstitch.io.read import read_image
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.synthetic import sequence_over

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from examples.judging.fitting import FITS, apply, fit_similarity, quantile
 from examples.judging.patches import patch_displacements
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import Float32Array, FloatArray
 from rdstitch.errors import ArgumentError
-from rdstitch.synthetic.textures import ImageTexture, LinearPixels, Texture
+from rdstitch.synthetic.textures import ImageTexture, Texture
 
 _ROUNDS = 5
 # A transform that moves no patch by more than this, px, will not change any more.
@@ -124,14 +124,14 @@ def coverage(filled: NDArray[np.bool_], transform: ArrayLike, reachable: NDArray
     return float((shown[inner] > 0).mean())
 
 
-def sharpness(image: LinearPixels, reference: LinearPixels, where: NDArray[np.bool_]) -> float:
+def sharpness(image: Float32Array, reference: Float32Array, where: NDArray[np.bool_]) -> float:
     """Detail of an image in units of the detail of another one that shows the same, both grey in [0, 1].
 
     Detail is the root mean square of the Laplacian of Gaussian (σ = 1 px) in units of the standard deviation of the
     image blurred by σ = 4 px: it takes no notice of gain and offset, but noise counts as detail.
     """
 
-    def detail(grey: LinearPixels) -> float:
+    def detail(grey: Float32Array) -> float:
         fine = cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), 1.0), cv2.CV_32F)
         coarse = cv2.GaussianBlur(grey, (0, 0), 4.0)
         return float(np.sqrt(np.mean(fine[where] ** 2)) / np.std(coarse[where]))
@@ -139,7 +139,7 @@ def sharpness(image: LinearPixels, reference: LinearPixels, where: NDArray[np.bo
     return detail(image) / detail(reference)
 
 
-def plane_under(plane: Texture, transform: ArrayLike, size: tuple[int, int]) -> tuple[LinearPixels, NDArray[np.bool_]]:
+def plane_under(plane: Texture, transform: ArrayLike, size: tuple[int, int]) -> tuple[Float32Array, NDArray[np.bool_]]:
     """The true plane as a perfect mosaic of a given size (width, height) shows it: grey (h, w), and where there is any.
 
     ``transform`` is from mosaic px to texels.
@@ -150,8 +150,8 @@ def plane_under(plane: Texture, transform: ArrayLike, size: tuple[int, int]) -> 
 
 
 def _drawn_over(
-    truth: LinearPixels, transform: FloatArray, shape: tuple[int, ...]
-) -> tuple[LinearPixels, NDArray[np.bool_]]:
+    truth: Float32Array, transform: FloatArray, shape: tuple[int, ...]
+) -> tuple[Float32Array, NDArray[np.bool_]]:
     """The plane in the mosaic's place, low-passed as far as the mosaic is coarser, and where there is any plane."""
     scale = _texels_per_pixel(transform, shape)
     if scale > 1.0:
@@ -171,7 +171,7 @@ def _texels_per_pixel(transform: FloatArray, shape: tuple[int, ...]) -> float:
     return float(np.sqrt(np.abs(np.linalg.det(np.stack([right - here, down - here])))))
 
 
-def _place_by_features(grey: LinearPixels, filled: NDArray[np.bool_], truth: LinearPixels) -> FloatArray | None:
+def _place_by_features(grey: Float32Array, filled: NDArray[np.bool_], truth: Float32Array) -> FloatArray | None:
     """A rough similarity from mosaic px to texels, or None where there is nothing in common.
 
     Matches that agree only roughly take part on purpose: a mosaic that has drifted should be laid on the plane as a
@@ -188,7 +188,7 @@ def _place_by_features(grey: LinearPixels, filled: NDArray[np.bool_], truth: Lin
     return fit_similarity(a[agreed], b[agreed])
 
 
-def matches(grey: LinearPixels, filled: NDArray[np.bool_], truth: LinearPixels) -> tuple[FloatArray, FloatArray]:
+def matches(grey: Float32Array, filled: NDArray[np.bool_], truth: Float32Array) -> tuple[FloatArray, FloatArray]:
     """Places (N, 2) of a mosaic and of the truth that look alike."""
     (points1, descriptors1), (points2, descriptors2) = features(grey, filled), features(truth, None)
     if min(len(descriptors1), len(descriptors2)) < 2:
@@ -199,7 +199,7 @@ def matches(grey: LinearPixels, filled: NDArray[np.bool_], truth: LinearPixels) 
     return points1[one], points2[other]
 
 
-def features(grey: LinearPixels, mask: NDArray[np.bool_] | None) -> tuple[FloatArray, NDArray[np.float32]]:
+def features(grey: Float32Array, mask: NDArray[np.bool_] | None) -> tuple[FloatArray, NDArray[np.float32]]:
     """SIFT points in px and descriptors, from an image reduced to a moderate size."""
     factor = min(1.0, float(np.sqrt(_FEATURE_PIXELS / grey.size)))
     size = (max(1, round(grey.shape[1] * factor)), max(1, round(grey.shape[0] * factor)))
@@ -213,7 +213,7 @@ def features(grey: LinearPixels, mask: NDArray[np.bool_] | None) -> tuple[FloatA
     return at_full_size, np.asarray(descriptors, dtype=np.float32)
 
 
-def grey_and_filled(mosaic: NDArray[Any]) -> tuple[LinearPixels, NDArray[np.bool_]]:
+def grey_and_filled(mosaic: NDArray[Any]) -> tuple[Float32Array, NDArray[np.bool_]]:
     """Grey levels in [0, 1] and which px are filled."""
     if mosaic.ndim not in (2, 3) or (mosaic.ndim == 3 and mosaic.shape[2] not in (3, 4)):
         raise ArgumentError(f"a mosaic has shape (h, w), (h, w, 3) or (h, w, 4), not {mosaic.shape}")
@@ -229,7 +229,7 @@ def grey_and_filled(mosaic: NDArray[Any]) -> tuple[LinearPixels, NDArray[np.bool
     return _grey(ImageTexture(colours).region(0, 0, width, height)), filled
 
 
-def _grey(image: LinearPixels) -> LinearPixels:
+def _grey(image: Float32Array) -> Float32Array:
     """Luma of RGB (h, w, 3), or the only channel of (h, w, 1); shape (h, w)."""
     if image.shape[2] == 1:
         return np.ascontiguousarray(image[:, :, 0])

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
-from rdstitch.synthetic.textures import LinearPixels
+from rdstitch.arrays import Float32Array, FloatArray
 
 _ITERATIONS = 5
 _PATCHES = 5000
@@ -38,7 +37,7 @@ class Displacements:
 
 
 def patch_displacements(
-    image: LinearPixels, other: LinearPixels, valid: NDArray[np.bool_], search: int
+    image: Float32Array, other: Float32Array, valid: NDArray[np.bool_], search: int
 ) -> Displacements:
     """Look for patches of an image in another one that shows nearly the same.
 
@@ -80,7 +79,7 @@ def patch_displacements(
 
 
 def _refine(
-    templates: LinearPixels, layers: list[LinearPixels], center: FloatArray, start: FloatArray
+    templates: Float32Array, layers: list[Float32Array], center: FloatArray, start: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Displacement (P, 2) that minimises the squared difference up to gain and offset, and the correlation there.
 

@@ -13,8 +13,7 @@ from examples.judging.comparison import grey_and_filled, matches
 from examples.judging.fitting import quantile
 from examples.judging.patches import patch_displacements
 from examples.worlds.turns import TurningSequence
-from rdstitch.arrays import FloatArray
-from rdstitch.synthetic.textures import LinearPixels
+from rdstitch.arrays import Float32Array, FloatArray
 
 _ROUNDS = 3
 _MIN_MATCHES = 12
@@ -133,7 +132,7 @@ def _ahead(longitude: FloatArray, latitude: FloatArray) -> FloatArray:
     return np.stack([np.sin(longitude) * level, np.sin(latitude), np.cos(longitude) * level], axis=-1)
 
 
-def _drawn(truth: LinearPixels, directions: FloatArray) -> LinearPixels:
+def _drawn(truth: Float32Array, directions: FloatArray) -> Float32Array:
     """The sphere's texture (h, w) as directions (m, n, 3) show it."""
     x, y, z = np.moveaxis(directions, -1, 0)
     per_radian = truth.shape[1] / (2.0 * np.pi)

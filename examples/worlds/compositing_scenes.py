@@ -14,8 +14,8 @@ from rdstitch.arrays import FloatArray
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedImage, compose, plan_canvas
 from rdstitch.compositing.source_images import Displacement, ImageLoader
 from rdstitch.geometry.camera import Camera
-from rdstitch.io import DecodedImage, Metadata
-from rdstitch.io.read import reduced
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.read import DecodedImage, reduced
 from rdstitch.synthetic.poses import grid_poses
 from rdstitch.synthetic.rendering import Photometry, RenderedSequence, sequence_over
 from rdstitch.synthetic.textures import ground

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import Float32Array, FloatArray
 from rdstitch.synthetic.lenses import Lens, focal_length
 from rdstitch.synthetic.poses import Poses
 from rdstitch.synthetic.rendering import Photometry, RenderedSequence
-from rdstitch.synthetic.textures import LinearPixels, Texture, ground
+from rdstitch.synthetic.textures import Texture, ground
 
 
 def camera_rotations(heading: ArrayLike, pitch: ArrayLike = 0.0, roll: ArrayLike = 0.0) -> FloatArray:
@@ -61,7 +61,7 @@ class _Around:
         """1 for grey, 3 for RGB."""
         return self.texture.channels
 
-    def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
+    def region(self, left: int, top: int, right: int, bottom: int) -> Float32Array:
         width = self.texture.size[0]
         rows = self.texture.region(0, top, width, bottom)
         return rows.take(np.arange(left, right) % width, axis=1)

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from rdstitch.camera_files.embedded_camera import COMMENT, FIELD
 from rdstitch.camera_files.lens_models import CameraFile, LensFit
@@ -167,13 +167,12 @@ def format_of(path: str | Path, camera_format: CameraFormat = "auto") -> CameraF
     file = Path(path)
     name = file.name.lower().removesuffix(".yml")
     name += ".yaml" if name != file.name.lower() else ""
-    for each in _FORMATS:
-        if any(fnmatchcase(name, pattern) for pattern in each.names):
-            return each.name
-    known = ", ".join(each.name for each in _FORMATS)
+    for each, (patterns, _) in _FORMATS.items():
+        if any(fnmatchcase(name, pattern) for pattern in patterns):
+            return each
     raise OutputError(
         f"{file}: not the name of a camera file; use one that ends with {' '.join(CAMERA_SUFFIXES)}, or give "
-        f"--camera-format ({known})"
+        f"--camera-format ({', '.join(_FORMATS)})"
     )
 
 
@@ -185,28 +184,19 @@ def export_note(camera: Camera, path: str | Path, camera_format: CameraFormat = 
 
 def _written(camera: Camera, path: str | Path, camera_format: CameraFormat) -> tuple[str, LensFit | None]:
     """What is written, and how far the model of it is from the lens where it is not rdstitch's own."""
-    wanted = format_of(path, camera_format)
-    return next(each.write(camera) for each in _FORMATS if each.name == wanted)
+    return _FORMATS[format_of(path, camera_format)][1](camera)
 
 
-class _Format(NamedTuple):
-    """A format that is written."""
-
-    name: CameraFormat
-    names: tuple[str, ...]  # patterns of file names; ``.yml`` is ``.yaml``
-    write: Callable[[Camera], tuple[str, LensFit | None]]
-
-
-# The first whose pattern fits is what a name says.
-_FORMATS = (
-    _Format("opendronemap", ("cameras.json",), opendronemap_json),
-    _Format("opencv-json", ("opencv.json", "*.opencv.json"), partial(opencv_text, yaml=False)),
-    _Format("rdstitch", ("?*.json",), lambda camera: (json_bytes(camera_json(camera)).decode(), None)),
-    _Format("ros", ("camera_info.yaml",), camera_info_yaml),
-    _Format("kalibr", ("camchain.yaml",), camera_chain_yaml),
-    _Format("fisheye", ("fisheye.yaml", "*.fisheye.yaml"), partial(opencv_text, fisheye=True)),
-    _Format("opencv", ("?*.yaml",), opencv_text),
-    _Format("colmap", ("cameras.txt",), colmap_text),
-    _Format("hugin", ("?*.pto",), hugin_project),
-    _Format("lensfun", ("?*.xml",), lensfun_xml),
-)
+# Patterns of the names of files, of which ``.yml`` is ``.yaml``, and what is written; the first that fits counts.
+_FORMATS: dict[CameraFormat, tuple[tuple[str, ...], Callable[[Camera], tuple[str, LensFit | None]]]] = {
+    "opendronemap": (("cameras.json",), opendronemap_json),
+    "opencv-json": (("opencv.json", "*.opencv.json"), partial(opencv_text, yaml=False)),
+    "rdstitch": (("?*.json",), lambda camera: (json_bytes(camera_json(camera)).decode(), None)),
+    "ros": (("camera_info.yaml",), camera_info_yaml),
+    "kalibr": (("camchain.yaml",), camera_chain_yaml),
+    "fisheye": (("fisheye.yaml", "*.fisheye.yaml"), partial(opencv_text, fisheye=True)),
+    "opencv": (("?*.yaml",), opencv_text),
+    "colmap": (("cameras.txt",), colmap_text),
+    "hugin": (("?*.pto",), hugin_project),
+    "lensfun": (("?*.xml",), lensfun_xml),
+}

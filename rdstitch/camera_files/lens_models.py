@@ -41,8 +41,7 @@ class LensFit:
 def _least_squares(terms: FloatArray, values: FloatArray) -> FloatArray:
     """Solve ``terms x = values`` by least squares, with columns of one size."""
     size = np.maximum(np.abs(terms).max(axis=0), 1e-300)
-    solution: FloatArray = np.linalg.lstsq(terms / size, values, rcond=None)[0] / size
-    return solution
+    return np.asarray(np.linalg.lstsq(terms / size, values, rcond=None)[0] / size)
 
 
 @dataclass(frozen=True, eq=False)

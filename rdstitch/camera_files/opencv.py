@@ -86,7 +86,6 @@ class _OpenCV(Struct, kw_only=True):
 
     @property
     def coefficients(self) -> tuple[float, ...]:
-        """Those of the distortion."""
         return tuple(self.distortion_coefficients.data)
 
     def lens(self, *, fisheye: bool) -> LensModel:

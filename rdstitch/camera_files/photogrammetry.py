@@ -64,21 +64,13 @@ def read_colmap(camera: Sequence[str], file: str) -> CameraFile:
     # COLMAP's pixels have their centres at halves.
     focal, center = (values[0], values[focals - 1]), (values[focals] - 0.5, values[focals + 1] - 0.5)
     if "DIVISION" in model:
-        return CameraFile(_division_camera(size, focal, center, values[-1]), "COLMAP")
+        if not math.isclose(*focal, rel_tol=1e-6):
+            one = f"a division model needs one focal length for x and y, not {focal[0]:g}, {focal[1]:g}"
+            raise ArgumentError(f"PARAMS: {one}")
+        plain = Camera(size, center=center, focal=focal[0], focal_source="file")
+        return CameraFile(plain.with_coefficients(values[-1] * (plain.scale / focal[0]) ** 2), "COLMAP")
     lens = LensModel(focal, center, tuple(values[focals + 2 :]), kind_of("FISHEYE" in model))
     return fitted_camera(lens, "COLMAP", size)
-
-
-def _division_camera(
-    size: tuple[int, int], focal: tuple[float, float], center: tuple[float, float], distortion: float
-) -> Camera:
-    """A camera of the division model, whose λ is that of focal lengths."""
-    if not math.isclose(*focal, rel_tol=1e-6):
-        raise ArgumentError(
-            f"PARAMS: a division model needs one focal length for x and y, not {focal[0]:g}, {focal[1]:g}"
-        )
-    camera = Camera(size, center=center, focal=focal[0], focal_source="file")
-    return camera.with_coefficients(distortion * (camera.scale / focal[0]) ** 2)
 
 
 def colmap_text(camera: Camera) -> Written:

@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from rdstitch.compositing.boxes import Box, Float32Array
+from rdstitch.arrays import Float32Array
+from rdstitch.compositing.boxes import Box
 
 _WEIGHT_STEPS = np.float32(4096.0)
 

@@ -1,18 +1,15 @@
 """Boxes of pixels, on the canvas or in an image, arrays of values on them, and which of many boxes overlap."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import AnyArray, FloatArray, IntArray
 from rdstitch.system.late_imports import csgraph, sparse
 
 Box = tuple[int, int, int, int]
 """x0, y0, x1, y1, pixels, end exclusive."""
 
-Float32Array = NDArray[np.float32]
 # All of them in ordinary folders; a survey with 70 and 50 % of overlap has about 20.
 _MAX_NEIGHBOURS = 20
 _BOXES_AT_ONCE = 256  # that are compared with the others: of 10,000 each may have hundreds beside it
@@ -50,7 +47,7 @@ def without(box: Box, hole: Box | None) -> list[Box]:
     return [part for part in parts if part[0] < part[2] and part[1] < part[3]]
 
 
-def bounds(values: NDArray[Any], box: Box) -> Box | None:
+def bounds(values: AnyArray, box: Box) -> Box | None:
     """Smallest box that holds all values on ``box`` that are not 0; None where there are none."""
     rows, columns = (np.flatnonzero(values.any(axis=axis)) for axis in (1, 0))
     if not len(rows):
@@ -59,13 +56,13 @@ def bounds(values: NDArray[Any], box: Box) -> Box | None:
     return int(x + columns[0]), int(y + rows[0]), int(x + columns[-1] + 1), int(y + rows[-1] + 1)
 
 
-def cut(values: NDArray[Any], box: Box, part: Box) -> NDArray[Any]:
+def cut(values: AnyArray, box: Box, part: Box) -> AnyArray:
     """View of the values on ``box`` that lie on ``part``."""
     x, y = part[0] - box[0], part[1] - box[1]
     return values[y : y + part[3] - part[1], x : x + part[2] - part[0]]
 
 
-def overlapping_pairs(boxes: Sequence[Box | None], most: int = _MAX_NEIGHBOURS) -> NDArray[np.intp]:
+def overlapping_pairs(boxes: Sequence[Box | None], most: int = _MAX_NEIGHBOURS) -> IntArray:
     """Pairs of boxes that have pixels in common, found without looking at every pair.
 
     Shape (P, 2), ascending, the larger index first; None is an image that is nowhere. Where a box overlaps more than
@@ -95,12 +92,12 @@ def overlapping_pairs(boxes: Sequence[Box | None], most: int = _MAX_NEIGHBOURS) 
     return _largest(pairs[ascending], fraction[ascending], len(boxes), most)
 
 
-def _sides(edges: NDArray[np.intp], first: NDArray[np.intp], second: NDArray[np.intp]) -> NDArray[np.intp]:
+def _sides(edges: IntArray, first: IntArray, second: IntArray) -> IntArray:
     """Width and height (P, 2) of what boxes have in common, by their edges (N, 4); not positive without any."""
     return np.minimum(edges[first, 2:], edges[second, 2:]) - np.maximum(edges[first, :2], edges[second, :2])
 
 
-def _largest(pairs: NDArray[np.intp], fraction: FloatArray, count: int, most: int) -> NDArray[np.intp]:
+def _largest(pairs: IntArray, fraction: FloatArray, count: int, most: int) -> IntArray:
     """The pairs of the largest shares, ``most`` of each image, and a spanning tree."""
     ends = pairs.T.ravel()
     degree = np.bincount(ends, minlength=count)

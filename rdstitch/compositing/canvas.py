@@ -70,9 +70,12 @@ class Canvas:
 
     def on_grid(self, matrix: FloatArray, size: tuple[int, int]) -> "Canvas":
         """The same plane on other pixels, which images may lie beyond."""
-        change = matrix @ np.linalg.inv(self.matrix)
+        return replace(self._changed(matrix @ np.linalg.inv(self.matrix), size), matrix=matrix)
+
+    def _changed(self, change: FloatArray, size: tuple[int, int]) -> "Canvas":
+        """Other pixels, to which a similarity (3, 3) leads."""
         outlines = tuple(outline @ change[:2, :2].T + change[:2, 2] for outline in self.footprints)
-        return replace(self, size=size, matrix=matrix, footprints=outlines)
+        return replace(self, size=size, matrix=change @ self.matrix, footprints=outlines)
 
     def areas(self) -> list[int]:
         """Area of the bounds of every image, as if it had only one place on the canvas, square pixels."""
@@ -101,8 +104,7 @@ class Canvas:
         if self.projection == PLANE:
             return to_plane(camera, self.matrix @ homography, points)
         directions = to_directions(camera, homography, points)
-        places: FloatArray = self.projection.project(directions) @ self.matrix[:2, :2].T + self.matrix[:2, 2]
-        return places
+        return np.asarray(self.projection.project(directions) @ self.matrix[:2, :2].T + self.matrix[:2, 2])
 
     def cut_away(self, cameras: Sequence[Camera], homographies: FloatArray) -> float:
         """Share of what the images show that has no place here, because it would be stretched too much."""
@@ -120,31 +122,19 @@ class Canvas:
         """The part (x0, y0, x1, y1) of this canvas as a canvas of its own."""
         x0, y0, x1, y1 = box
         shift = np.array([[1.0, 0.0, -x0], [0.0, 1.0, -y0], [0.0, 0.0, 1.0]])
-        footprints = tuple(outline - (x0, y0) for outline in self.footprints)
-        wanted = None
-        if self.cropped_to is not None:
-            left, top, right, bottom = self.cropped_to
-            wanted = left - x0, top - y0, right - x0, bottom - y0
-        size = x1 - x0, y1 - y0
-        return replace(self, size=size, matrix=shift @ self.matrix, footprints=footprints, cropped_to=wanted)
-
-    def widened(self, margin: int) -> "Canvas":
-        """The same with ``margin`` pixels more on the left and on the right."""
-        return self.cropped((-margin, 0, self.size[0] + margin, self.size[1]))
+        wanted = self.cropped_to
+        if wanted is not None:
+            wanted = wanted[0] - x0, wanted[1] - y0, wanted[2] - x0, wanted[3] - y0
+        return replace(self._changed(shift, (x1 - x0, y1 - y0)), cropped_to=wanted)
 
     def reduced(self, factor: int) -> "Canvas":
         """The same canvas with pixels ``factor`` times as large."""
         width, height = (-(-n // factor) for n in self.size)
         shift = 0.5 / factor - 0.5
         to_reduced = np.array([[1.0 / factor, 0.0, shift], [0.0, 1.0 / factor, shift], [0.0, 0.0, 1.0]])
-        return replace(
-            self,
-            size=(width, height),
-            matrix=to_reduced @ self.matrix,
-            footprints=tuple(outline / factor + shift for outline in self.footprints),
-            period=None if self.period is None else self.period / factor,
-            cropped_to=None,  # what a crop leaves is decided at full size
-        )
+        period = None if self.period is None else self.period / factor
+        # What a crop leaves is decided at full size.
+        return replace(self._changed(to_reduced, (width, height)), period=period, cropped_to=None)
 
 
 def plan_canvas(
@@ -165,7 +155,7 @@ def plan_canvas(
     """
     matrices = np.asarray(homographies, dtype=np.float64)
     called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)
-    check_placement(cameras, matrices, scale, rotate, reference, called, max_stretch)
+    refuse_singular(matrices, called)
     to_plane = [_oriented(c, g) for c, g in zip(cameras, matrices, strict=True)]
     px_per_unit = np.array([_resolution(c, g) for c, g in zip(cameras, to_plane, strict=True)])
     usual = abs(px_per_unit[reference]) if reference is not None else np.nanmedian(np.abs(px_per_unit))
@@ -201,26 +191,8 @@ def canvas_between(low: FloatArray, high: FloatArray, linear: FloatArray, outlin
     return Canvas((int(size[0]), int(size[1])), matrix, tuple(outline - low - 0.5 for outline in outlines))
 
 
-def check_placement(
-    cameras: Sequence[Camera],
-    matrices: FloatArray,
-    scale: float,
-    rotate: float,
-    reference: int | None,
-    names: Sequence[str],
-    max_stretch: float,
-) -> None:
-    """Refuse arguments of :func:`plan_canvas` that do not fit together."""
-    if not cameras or matrices.shape != (len(cameras), 3, 3) or len(names) != len(cameras):
-        raise ArgumentError(f"expected one homography (3, 3) per camera, not {matrices.shape} for {len(cameras)}")
-    if not (math.isfinite(scale) and scale > 0):
-        raise ArgumentError(f"scale must be positive, not {scale}")
-    if not math.isfinite(rotate):
-        raise ArgumentError(f"rotate must be an angle in degrees, not {rotate}")
-    if reference is not None and not 0 <= reference < len(cameras):
-        raise ArgumentError(f"reference must be the index of one of {len(cameras)} images, not {reference}")
-    if not max_stretch > 1.0:
-        raise ArgumentError(f"max_stretch must be larger than 1, not {max_stretch}")
+def refuse_singular(matrices: FloatArray, names: Sequence[str]) -> None:
+    """Refuse a homography that no image can be drawn by."""
     for matrix, name in zip(matrices, names, strict=True):
         if not np.isfinite(matrix).all() or np.linalg.cond(matrix) > 1e12:
             raise ArgumentError(f"{name}: the homography is singular or not finite")
@@ -251,7 +223,6 @@ def _resolution(camera: Camera, matrix: FloatArray) -> float:
 
 
 def _refuse_mirrored(px_per_unit: FloatArray, names: Sequence[str]) -> None:
-    """Refuse an image that lies mirrored among the others."""
     usual = 1.0 if (px_per_unit > 0).sum() * 2 >= len(px_per_unit) else -1.0
     for value, name in zip(px_per_unit, names, strict=True):
         if value * usual < 0:

@@ -4,11 +4,10 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.photometric import Exposure
 from rdstitch.compositing.preparation import Decisions, decide, prepare_composite
@@ -25,7 +24,7 @@ from rdstitch.io.write import write_strips
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.results.messages import Message
 from rdstitch.system.outputs import Outputs
-from rdstitch.system.progress import FractionProgress, no_progress
+from rdstitch.system.progress import FractionProgress, silent
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -33,8 +32,8 @@ class Composite:
     """The stitched image."""
 
     # (H, W) or (H, W, C): in the sample type of the images, RGB order; 0 where no image lies
-    pixels: NDArray[Any]
-    alpha: NDArray[np.uint8]  # (H, W), uint8: 255 where an image lies, else 0
+    pixels: AnyArray
+    alpha: UInt8Array  # (H, W), uint8: 255 where an image lies, else 0
     canvas: Canvas  # geometry of ``pixels``, after cropping
     exposure: Exposure  # what the images were corrected by
     messages: tuple[Message, ...] = ()  # what the user should know, such as why nothing was cropped
@@ -60,7 +59,7 @@ def compose(images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOpt
 
 
 def compose_decided(
-    decisions: Decisions, progress: FractionProgress = no_progress, elsewhere: BlockRunner | None = None
+    decisions: Decisions, progress: FractionProgress = silent, elsewhere: BlockRunner | None = None
 ) -> Composite:
     """Put images together, in memory, once exposure and seams are decided.
 
@@ -82,7 +81,7 @@ def compose_decided(
 def compose_to_file(
     path: str | Path,
     decisions: Decisions,
-    progress: FractionProgress = no_progress,
+    progress: FractionProgress = silent,
     elsewhere: BlockRunner | None = None,
     *,
     metadata: Metadata | None = None,

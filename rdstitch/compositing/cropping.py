@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import BoolArray
 from rdstitch.compositing.boxes import Box, cut
 from rdstitch.compositing.survey import Survey
 
@@ -15,7 +15,7 @@ _RESOLUTION = 1500
 _MIN_KEPT = 0.25
 
 
-def covered_pixels(survey: Survey) -> NDArray[np.bool_]:
+def covered_pixels(survey: Survey) -> BoolArray:
     """Which pixels of the reduced canvas images cover."""
     covered = np.zeros(survey.canvas.size[::-1], dtype=np.bool_)
     for tile in survey.tiles:
@@ -31,7 +31,7 @@ class Crop(NamedTuple):
     kept: float  # fraction of what is covered that it keeps
 
 
-def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> Crop:
+def crop_box(covered: BoolArray, factor: int, size: tuple[int, int]) -> Crop:
     """Find the largest rectangle without holes.
 
     ``covered`` as of :func:`covered_pixels`, of which each takes ``factor`` pixels a side of a canvas of this size.
@@ -45,13 +45,12 @@ def crop_box(covered: NDArray[np.bool_], factor: int, size: tuple[int, int]) -> 
     cells = whole[: rows * coarse, : columns * coarse].reshape(rows, coarse, columns, coarse).min(axis=(1, 3)) > 0
     x0, y0, x1, y1 = largest_rectangle(cells)
     kept = (x1 - x0) * (y1 - y0) * coarse**2 / max(1, int(covered.sum()))
-    if kept < _MIN_KEPT:
-        return Crop(None, kept)
     unit = coarse * factor
-    return Crop((x0 * unit, y0 * unit, min(x1 * unit, size[0]), min(y1 * unit, size[1])), kept)
+    box = x0 * unit, y0 * unit, min(x1 * unit, size[0]), min(y1 * unit, size[1])
+    return Crop(None if kept < _MIN_KEPT else box, kept)
 
 
-def crop_rows(covered: NDArray[np.bool_], factor: int, size: tuple[int, int], whole: Box) -> Crop:
+def crop_rows(covered: BoolArray, factor: int, size: tuple[int, int], whole: Box) -> Crop:
     """Find the most rows without holes, at their full width, of a canvas that goes all the way round.
 
     ``whole`` is one full turn of it.
@@ -63,12 +62,11 @@ def crop_rows(covered: NDArray[np.bool_], factor: int, size: tuple[int, int], wh
     # A reduced pixel stands for those around its centre: one row less on each side makes sure of all of them.
     first, last = first + (first > 0), last - (last < len(covered))
     kept = max(0, int(last - first)) * covered.shape[1] / max(1, int(covered.sum()))
-    if kept < _MIN_KEPT:
-        return Crop(None, kept)
-    return Crop((whole[0], int(first) * factor, whole[2], min(int(last) * factor, size[1])), kept)
+    box = whole[0], int(first) * factor, whole[2], min(int(last) * factor, size[1])
+    return Crop(None if kept < _MIN_KEPT else box, kept)
 
 
-def largest_rectangle(cells: NDArray[np.bool_]) -> Box:
+def largest_rectangle(cells: BoolArray) -> Box:
     """Largest upright rectangle of true cells: x0, y0, x1, y1, end exclusive; empty where there is none.
 
     Row by row, the height of the column of true cells above each cell, and for each the widest run of columns at least

@@ -104,7 +104,6 @@ class ImageCache:
             return next(iter(self._held.items())) if self._held and self._nbytes() > room else None
 
     def _written(self, index: int, image: LoadedImage) -> ImageOnDisk | None:
-        """An image in a temporary file, where one can be written."""
         with suppress(OSError):
             self._folder = self._folder or TemporaryFolder()
             return ImageOnDisk.write(image, self._folder.path / str(index))

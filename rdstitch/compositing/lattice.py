@@ -6,8 +6,8 @@ from typing import Self
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray
-from rdstitch.compositing.boxes import Box, Float32Array
+from rdstitch.arrays import Float32Array, FloatArray
+from rdstitch.compositing.boxes import Box
 
 LATTICE_STEPS = (32, 16, 8, 4, 2, 1)  # spacings of lattices, canvas pixels; all have the nodes of the first
 _NOWHERE = np.float32(-1e6)
@@ -31,7 +31,9 @@ class Lattice:
         """Nodes by what maps x (1, n) and y (m, 1), canvas pixels, to pixels (m, n, 2) of an image."""
         (x0, x1), (y0, y1) = _enclosing(box, LATTICE_STEPS[0])
         x, y = (np.arange(start, stop + 1, step, dtype=np.float64) for start, stop in ((x0, x1), (y0, y1)))
-        return cls(box, step, _somewhere(places(x[None, :], y[:, None])))
+        points = places(x[None, :], y[:, None]).astype(np.float32)
+        points[~np.isfinite(points).all(axis=-1)] = _NOWHERE
+        return cls(box, step, points)
 
     def nodes(self, box: Box, step: int) -> Float32Array:
         """Pixels at the nodes that enclose a box within this one's, (m, n, 2), at this spacing or a wider one."""
@@ -69,10 +71,3 @@ def _enclosing(box: Box, step: int) -> tuple[tuple[int, int], tuple[int, int]]:
     x0, y0, x1, y1 = box
     across, down = ((start // step * step, ((stop - 1) // step + 1) * step) for start, stop in ((x0, x1), (y0, y1)))
     return across, down
-
-
-def _somewhere(points: FloatArray) -> Float32Array:
-    """Places in an image, far outside where there are none."""
-    placed = points.astype(np.float32)
-    placed[~np.isfinite(placed).all(axis=-1)] = _NOWHERE
-    return placed

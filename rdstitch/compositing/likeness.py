@@ -3,13 +3,12 @@
 import math
 from collections.abc import Sequence
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import BoolArray, IntArray
-from rdstitch.compositing.boxes import Float32Array, cut, intersection
+from rdstitch.arrays import AnyArray, BoolArray, Float32Array, IntArray
+from rdstitch.compositing.boxes import cut, intersection
 from rdstitch.compositing.seam_quality import CONTRAST, UNLIKE, SeamTile, correlation
 
 _COARSER = 3  # times smaller, that overlaps are compared
@@ -57,7 +56,7 @@ def _textured(grey: Float32Array, inside: BoolArray, full: float) -> tuple[Float
     return cells, np.asarray(shows)
 
 
-def _in_cells(values: NDArray[Any]) -> NDArray[Any]:
+def _in_cells(values: AnyArray) -> AnyArray:
     """Values (h, w) by cells (N, pixels)."""
     rows, columns = (n // _CELL for n in values.shape)
     whole = values[: rows * _CELL, : columns * _CELL].reshape(rows, _CELL, columns, _CELL)
@@ -74,7 +73,7 @@ def _smaller(tile: SeamTile) -> SeamTile:
     return SeamTile((left, top, left + columns, top + rows), grey / np.float32(_COARSER**2), inside)
 
 
-def _in_blocks(reduce_by: np.ufunc, values: NDArray[Any]) -> NDArray[Any]:
+def _in_blocks(reduce_by: np.ufunc, values: AnyArray) -> AnyArray:
     """Values (h, w) reduced in blocks, by rows and then by columns: NumPy reduces short axes many times slower."""
     rows = reduce(reduce_by, [values[k::_COARSER] for k in range(_COARSER)])
     return np.asarray(reduce(reduce_by, [rows[:, k::_COARSER] for k in range(_COARSER)]))

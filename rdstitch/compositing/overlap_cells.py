@@ -4,13 +4,12 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import reduce
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.compositing.boxes import Box, Float32Array, cut
+from rdstitch.arrays import AnyArray, BoolArray, Float32Array, FloatArray, IntArray, UInt8Array
+from rdstitch.compositing.boxes import Box, cut
 from rdstitch.compositing.photometric import full_scale
 from rdstitch.compositing.survey import Survey, SurveyTile
 from rdstitch.system.late_imports import sparse
@@ -68,7 +67,7 @@ class _Shown(NamedTuple):
     """What is compared of an image."""
 
     tile: SurveyTile
-    light: NDArray[np.uint8]  # (h, w): see _light
+    light: UInt8Array  # (h, w): see _light
     grey: Float32Array  # (h, w), share of the full range
     area: int  # pixels
 
@@ -84,10 +83,9 @@ def compare_overlaps(survey: Survey, workers: int = 1) -> Cells | None:
     overlap_fractions, cells = np.zeros(len(pairs)), list[tuple[IntArray, FloatArray, FloatArray]]()
 
     def compared(first: int) -> list[tuple[IntArray, FloatArray, FloatArray]]:
-        """The cells of some pairs."""
         of_pairs = []
         for index, (i, j) in enumerate(pairs[first : first + _PAIRS_AT_A_TIME].tolist(), start=first):
-            _, _, box, seen = survey.overlap(i, j)
+            box, seen = survey.overlap(i, j)
             overlap_fractions[index] = np.count_nonzero(seen) / min(shown[i].area, shown[j].area)
             for middles, means in _cells_of_overlap(shown[i], shown[j], box):
                 every = max(1, -(-len(means) * len(pairs) // _MAX_CELLS))
@@ -121,7 +119,7 @@ def _cells_of_overlap(a: _Shown, b: _Shown, box: Box) -> Iterator[tuple[FloatArr
     """
     side = max(2, round(max(*a.tile.inside.shape, *b.tile.inside.shape) / _CELLS))
     step = max(1, side // _SAMPLES)
-    compared: list[tuple[NDArray[Any], NDArray[Any]]] = [
+    compared: list[tuple[AnyArray, AnyArray]] = [
         (a.light, b.light),
         (a.grey, b.grey),
         (a.tile.pixels, b.tile.pixels),
@@ -155,14 +153,14 @@ def _evidence(moments: FloatArray, clipped: BoolArray) -> FloatArray:
     return np.asarray(alike * (patterned + (1.0 - patterned) * _PLAIN_COUNTS))
 
 
-def _grey(pixels: NDArray[Any]) -> Float32Array:
+def _grey(pixels: AnyArray) -> Float32Array:
     """Mean of the channels (h, w), share of the full range."""
     channels = pixels.shape[2]
     weights = np.full(channels, 1.0 / (channels * full_scale(pixels.dtype)), np.float32)
     return np.asarray(pixels @ weights, dtype=np.float32)
 
 
-def _light(tile: SurveyTile) -> NDArray[np.uint8]:
+def _light(tile: SurveyTile) -> UInt8Array:
     """Which pixels (h, w) say how bright the scene is: 1; 2 where a channel is clipped, 4 where all are, 0 for none."""
     integer, full = tile.pixels.dtype.kind == "u", full_scale(tile.pixels.dtype)
     darkest, brightest = (_DARKEST * full, BRIGHTEST * full) if integer else (0.0, np.inf)

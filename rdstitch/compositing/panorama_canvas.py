@@ -11,9 +11,9 @@ from rdstitch.choices import ProjectionName
 from rdstitch.compositing.canvas import (
     Canvas,
     canvas_between,
-    check_placement,
     plan_canvas,
     refuse_scale,
+    refuse_singular,
     turned_and_scaled,
 )
 from rdstitch.compositing.projection import PLANE, PROJECTIONS, TURN, Projection
@@ -103,9 +103,7 @@ def plan_panorama(
     ``max_stretch`` times has no place on it: the ends of a plane, the top and the bottom of a cylinder.
     """
     called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)
-    check_placement(cameras, directions, scale, rotate, reference, called, max_stretch)
-    if projection != "auto" and projection not in PROJECTIONS:
-        raise ArgumentError(f"projection must be one of auto, {', '.join(PROJECTIONS)}, not {projection!r}")
+    refuse_singular(directions, called)
     seen = seen_directions(cameras, directions)
     chosen = choose_projection(seen) if projection == "auto" else PROJECTIONS[projection]
     if chosen == PLANE:
@@ -234,8 +232,7 @@ def directions_on(canvas: Canvas, points: FloatArray) -> FloatArray:
     places = np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(canvas.matrix).T
     parts = canvas.projection.directions(places[:, 0], places[:, 1])
     directions = np.stack(np.broadcast_arrays(*parts), axis=-1)
-    unit: FloatArray = directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    return unit
+    return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
 
 def field_of_view(canvas: Canvas) -> tuple[float, float]:

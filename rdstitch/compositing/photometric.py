@@ -15,10 +15,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
-from rdstitch.compositing.boxes import Float32Array
+from rdstitch.arrays import AnyArray, Float32Array, FloatArray, IntArray
 from rdstitch.compositing.lattice import LATTICE_STEPS, interpolated
 from rdstitch.compositing.warp import Geometry
 from rdstitch.errors import ArgumentError
@@ -72,7 +70,7 @@ class Exposure:
             log = log + (values[nodes] * shares[..., None]).sum(axis=-2)
         return np.asarray(log, dtype=np.float64)
 
-    def correct(self, index: int, geometry: Geometry, pixels: NDArray[Any]) -> NDArray[Any]:
+    def correct(self, index: int, geometry: Geometry, pixels: AnyArray) -> AnyArray:
         """Resampled pixels (h, w, C) of image ``index``, as if all were exposed alike.
 
         In the type of the pixels. Each depends on nothing but itself: every box gives the same, bit for bit.
@@ -88,12 +86,9 @@ class Exposure:
     def factors(self, index: int, geometry: Geometry) -> Float32Array:
         """What samples of image ``index`` are multiplied by, (h, w, C), before highlights are compressed."""
         gain = np.exp(-self.log_gain[index]).astype(np.float32)
-        if not (self.vignetting.any() or self.fields.size):
-            return np.broadcast_to(gain, (*geometry.shape, len(gain)))
-        nodes = self._smooth_nodes(index, geometry) * gain
-        return _joined(_planes(nodes, geometry))
+        return _joined(_planes(self._smooth_nodes(index, geometry) * gain, geometry))
 
-    def _apply(self, pixels: NDArray[Any], factors: list[Any], rates: list[Any]) -> NDArray[Any]:
+    def _apply(self, pixels: AnyArray, factors: list[Any], rates: list[Any]) -> AnyArray:
         """``q (v + b) - b``, compressed above the knee; one array for all channels, or one plane a channel."""
         full = np.float32(full_scale(pixels.dtype))
         offset, knee = np.float32(self.offset) * full, np.float32(KNEE) * full
@@ -155,7 +150,7 @@ def squared_radius(camera: Camera, points: FloatArray) -> FloatArray:
     return np.asarray((camera.normalize(points) ** 2).sum(axis=-1), dtype=np.float64)
 
 
-def bilinear_weights(camera: Camera, points: FloatArray, side: int) -> tuple[NDArray[np.intp], FloatArray]:
+def bilinear_weights(camera: Camera, points: FloatArray, side: int) -> tuple[IntArray, FloatArray]:
     """Interpolation on a grid of ``side`` x ``side`` nodes over an image: four nodes (..., 4) and their shares."""
     return nodes_around((np.asarray(points) + 0.5) / camera.image_size * (side - 1), (side, side))
 

@@ -57,7 +57,8 @@ class _Task:
         (width, height), around = canvas.size, round(canvas.period)
         needed = _wrap_margin(canvas, plan.bands)
         left = needed + (width - around) // 2
-        return cls(images, canvas.widened(needed), options, reader, plan, (left, 0, left + around, height))
+        wider = canvas.cropped((-needed, 0, width + needed, height))
+        return cls(images, wider, options, reader, plan, (left, 0, left + around, height))
 
 
 @dataclass(frozen=True)

@@ -69,6 +69,9 @@ class _Longitude(Projection):
     """The longitude, and a function of the latitude's tangent."""
 
     periodic = True
+    _height: "ClassVar[staticmethod[..., FloatArray]]"  # of that
+    _slope: "ClassVar[staticmethod[..., FloatArray]]"  # its inverse
+    _highest: "ClassVar[staticmethod[..., float]]"  # y up to which it stretches no more than so many times
 
     def project(self, directions: FloatArray) -> FloatArray:
         """Places of all directions; infinite at poles, where that is so."""
@@ -84,44 +87,21 @@ class _Longitude(Projection):
         """The limit in latitude; all longitudes."""
         return math.inf, self._highest(min(max_stretch, _MAX_STRETCH))
 
-    @abstractmethod
-    def _height(self, slope: FloatArray) -> FloatArray: ...
-
-    @abstractmethod
-    def _slope(self, height: FloatArray) -> FloatArray: ...
-
-    @abstractmethod
-    def _highest(self, stretch: float) -> float: ...
-
 
 class Cylinder(_Longitude):
     """``(longitude, tan latitude)``: verticals stay straight; wide and low."""
 
     name = "cylinder"
-
-    def _height(self, slope: FloatArray) -> FloatArray:
-        return slope
-
-    def _slope(self, height: FloatArray) -> FloatArray:
-        return height
-
-    def _highest(self, stretch: float) -> float:
-        return math.sqrt(stretch - 1.0)  # heights grow with 1 / cos²
+    _height = _slope = staticmethod(lambda slope: slope)
+    _highest = staticmethod(lambda stretch: math.sqrt(stretch - 1.0))  # heights grow with 1 / cos²
 
 
 class Mercator(_Longitude):
     """``(longitude, asinh tan latitude)``: keeps shapes; between cylinder and sphere."""
 
     name = "mercator"
-
-    def _height(self, slope: FloatArray) -> FloatArray:
-        return np.arcsinh(slope)
-
-    def _slope(self, height: FloatArray) -> FloatArray:
-        return np.sinh(height)
-
-    def _highest(self, stretch: float) -> float:
-        return math.acosh(stretch)  # lengths grow with 1 / cos
+    _height, _slope = staticmethod(np.arcsinh), staticmethod(np.sinh)
+    _highest = staticmethod(math.acosh)  # lengths grow with 1 / cos
 
 
 class Sphere(_Longitude):
@@ -131,15 +111,9 @@ class Sphere(_Longitude):
     """
 
     name = "sphere"
-
-    def _height(self, slope: FloatArray) -> FloatArray:
-        return np.arctan(slope)
-
-    def _slope(self, height: FloatArray) -> FloatArray:
-        return np.where(np.abs(height) <= np.pi / 2, np.tan(height), np.nan)
-
-    def _highest(self, stretch: float) -> float:
-        return math.pi / 2.0
+    _height = staticmethod(np.arctan)
+    _slope = staticmethod(lambda height: np.where(np.abs(height) <= np.pi / 2, np.tan(height), np.nan))
+    _highest = staticmethod(lambda stretch: math.pi / 2.0)
 
 
 class Panini(Projection):

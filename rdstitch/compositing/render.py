@@ -8,10 +8,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, BoolArray, Float32Array, Int32Array, IntArray, UInt8Array
 from rdstitch.compositing.blender import MultibandBlender, margin, per_channel, rounding_constant
-from rdstitch.compositing.boxes import Box, Float32Array, aligned, bounds, cut, grown, intersection, without
+from rdstitch.compositing.boxes import Box, aligned, bounds, cut, grown, intersection, without
 from rdstitch.compositing.image_cache import ImageCache
 from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.resample import border_weight, sample, sample_opacity
@@ -55,7 +55,7 @@ class Renderer:
     channels: int
     dtype: np.dtype[Any]  # of the images' samples and of the output
 
-    def tile(self, box: Box) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    def tile(self, box: Box) -> tuple[AnyArray, BoolArray]:
         """Samples (h, w, C) and coverage (h, w) of one box of the canvas.
 
         What a pixel gets does not depend on the box.
@@ -110,11 +110,11 @@ class Renderer:
         return chosen
 
     @cached_property
-    def _bounds(self) -> NDArray[np.intp]:
+    def _bounds(self) -> IntArray:
         """Boxes of all images, (N, 4): tiles look at all of them."""
         return np.array([warp.box for warp in self.warps], dtype=np.intp).reshape(-1, 4)
 
-    def layer(self, index: int, box: Box) -> tuple[NDArray[Any], NDArray[np.bool_], NDArray[np.bool_]]:
+    def layer(self, index: int, box: Box) -> tuple[AnyArray, BoolArray, BoolArray]:
         """One image on its own in a box: samples (h, w, C), what it covers, and what of that the composite shows."""
         geometry = locate(self.warps[index], box)
         covered, opacity = geometry.inside, self._opacity(index, geometry)
@@ -135,7 +135,7 @@ class Renderer:
         for layer in layers:
             cut(total, box, layer.box)[...] += layer.weight
         np.maximum(total, np.finfo(np.float32).tiny, out=total)
-        shares = [replace(layer, weight=layer.weight / cut(total, box, layer.box)) for layer in layers]
+        shares = [replace(layer, weight=np.divide(layer.weight, cut(total, box, layer.box))) for layer in layers]
         return [part for layer in shares if (part := layer.weighted_part(box)) is not None]
 
     def _contact_zone(self, layers: Sequence[Layer], box: Box) -> Box | None:
@@ -156,7 +156,7 @@ class Renderer:
         """The box from which weights reach a box through multi-band blending."""
         return aligned(grown(box, margin(self.bands)), 1 << self.bands)
 
-    def _paste(self, layers: Sequence[Layer], box: Box, pixels: NDArray[Any]) -> None:
+    def _paste(self, layers: Sequence[Layer], box: Box, pixels: AnyArray) -> None:
         """Fill ``pixels``, which are those of ``box``, with the layers, or with their weighted mean."""
         parts = [part for layer in layers if (part := layer.weighted_part(box)) is not None]
         if self.options.blend != "feather":
@@ -171,7 +171,7 @@ class Renderer:
         total /= per_channel(np.where(weights > 0, weights, np.float32(1.0)), self.channels)
         pixels[...] = self._as_samples(total)
 
-    def _multiband(self, layers: Sequence[Layer], box: Box) -> NDArray[Any]:
+    def _multiband(self, layers: Sequence[Layer], box: Box) -> AnyArray:
         """Blend in bands, with the margin around the box that they need."""
         outer = self._blend_support(box)
         constant = rounding_constant(full_scale(self.dtype), self.dtype.kind == "u")
@@ -185,13 +185,12 @@ class Renderer:
             blender.add(part, self._samples(layer, part).astype(np.float32), weight)
         return self._as_samples(cut(blender.result(), outer, box))
 
-    def _as_samples(self, values: Float32Array) -> NDArray[Any]:
-        """Values in the output's type, rounded where it is whole numbers."""
+    def _as_samples(self, values: Float32Array) -> AnyArray:
         if self.dtype.kind != "u":
             return values.astype(self.dtype)
         return np.clip(np.rint(values), 0, np.float32(full_scale(self.dtype))).astype(self.dtype)
 
-    def _samples(self, layer: Layer, box: Box) -> NDArray[Any]:
+    def _samples(self, layer: Layer, box: Box) -> AnyArray:
         """Resampled and exposure-corrected samples (h, w, C) of one image; mirrored content outside of it."""
         geometry = layer.geometry.on(box)
         image = self.images.get(layer.index)
@@ -199,12 +198,11 @@ class Renderer:
         return self.exposure.correct(layer.index, geometry, pixels.reshape(*geometry.shape, self.channels))
 
     def _layers(self, box: Box) -> list[Layer]:
-        """Weights of all images that contribute to a box."""
         if self.seams is None and self.options.blend != "none":
             return list(self._bordered(box))
         return self._owned(box)
 
-    def _bordered(self, box: Box, wanted: NDArray[np.bool_] | None = None) -> Iterator[Layer]:
+    def _bordered(self, box: Box, wanted: BoolArray | None = None) -> Iterator[Layer]:
         """Every image that covers part of a box, or of what is wanted of it, with weights that fall to its border."""
         for index in self._reaching(box):
             part = intersection(self.warps[index].box, box)
@@ -272,7 +270,7 @@ class Renderer:
                 yield layer
 
 
-def _assign(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer) -> None:
+def _assign(owner: Int32Array, best: Float32Array, box: Box, layer: Layer) -> None:
     """Give a layer's image the pixels where its weight is the largest so far."""
     previous = cut(best, box, layer.box)
     better = layer.weight > previous
@@ -280,7 +278,7 @@ def _assign(owner: NDArray[np.int32], best: Float32Array, box: Box, layer: Layer
     np.copyto(cut(owner, box, layer.box), layer.index, where=better)
 
 
-def _only_owned(owner: NDArray[np.int32], box: Box, layer: Layer) -> Layer:
+def _only_owned(owner: Int32Array, box: Box, layer: Layer) -> Layer:
     """The layer with weight 1 where its image owns the pixels, and 0 elsewhere."""
     owned = cut(owner, box, layer.box) == layer.index
     # An image may have a layer from the seam map and one for what the map left over: each gets its own pixels.
@@ -288,6 +286,6 @@ def _only_owned(owner: NDArray[np.int32], box: Box, layer: Layer) -> Layer:
     return replace(layer, weight=owned.astype(np.float32))
 
 
-def _as_mask(chosen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def _as_mask(chosen: BoolArray) -> UInt8Array:
     """Not 0 where chosen, as OpenCV takes it."""
     return chosen.view(np.uint8)

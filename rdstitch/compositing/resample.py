@@ -1,12 +1,10 @@
 """The samples, opacity and weight of an image at the pixels of a box of the canvas."""
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing.boxes import Float32Array
+from rdstitch.arrays import AnyArray, Float32Array
 from rdstitch.compositing.source_images import LoadedImage
 from rdstitch.compositing.transparency import OPAQUE
 from rdstitch.compositing.warp import Geometry
@@ -36,7 +34,7 @@ def border_weight(geometry: Geometry) -> Float32Array:
     return weight
 
 
-def sample(image: LoadedImage, geometry: Geometry, interpolation: Interpolation = "cubic") -> NDArray[Any]:
+def sample(image: LoadedImage, geometry: Geometry, interpolation: Interpolation = "cubic") -> AnyArray:
     """Resample an image; content is mirrored outside of it, so that filters find no edge there.
 
     The image is prepared for ``geometry.warp.shrink``; the result is (h, w) or (h, w, C), in its sample type.
@@ -76,7 +74,7 @@ def _mirrored(reduction: int, geometry: Geometry) -> tuple[Float32Array, Float32
     return map_x, map_y
 
 
-def _remap_whole(pixels: NDArray[Any], map_x: Float32Array, map_y: Float32Array, interpolation: int) -> NDArray[Any]:
+def _remap_whole(pixels: AnyArray, map_x: Float32Array, map_y: Float32Array, interpolation: int) -> AnyArray:
     """``cv2.remap`` from an image; of a very long one, from the piece of it that is needed."""
     if max(pixels.shape[:2]) < _TOO_LONG:
         return remap(pixels, map_x, map_y, interpolation)
@@ -87,7 +85,7 @@ def _remap_whole(pixels: NDArray[Any], map_x: Float32Array, map_y: Float32Array,
     return remap(piece, map_x - np.float32(left), map_y - np.float32(top), interpolation)
 
 
-def remap(piece: NDArray[Any], map_x: NDArray[Any], map_y: NDArray[Any], interpolation: int) -> NDArray[Any]:
+def remap(piece: AnyArray, map_x: AnyArray, map_y: AnyArray, interpolation: int) -> AnyArray:
     """``cv2.remap`` for any number of channels."""
     channels = 1 if piece.ndim == 2 else piece.shape[2]
     if channels <= 4:

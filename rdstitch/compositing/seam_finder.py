@@ -14,9 +14,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.compositing.boxes import Box, Float32Array
+from rdstitch.arrays import AnyArray, BoolArray, Float32Array, Int32Array, UInt8Array
+from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.photometric import Exposure, full_scale
 from rdstitch.compositing.resample import border_weight
 from rdstitch.compositing.survey import Survey, SurveyTile
@@ -46,7 +46,7 @@ _MOVED = 3  # pixels by which it may then move
 class SeamMap:
     """Owner of each pixel of the reduced canvas."""
 
-    labels: NDArray[np.int32]  # (h, w), int32: index of the image, or -1 where there is none
+    labels: Int32Array  # (h, w), int32: index of the image, or -1 where there is none
     factor: int  # canvas pixels per reduced pixel, even or 1
     # shares pass from one owner to the next over so many reduced pixels on either side of a seam, for feathering
     softness: int = 0
@@ -95,7 +95,7 @@ class SeamMap:
         number[list(images)] = np.arange(len(images))
         return replace(self, labels=number[labels], origin=(self.origin[0] + left, self.origin[1] + top))
 
-    def _window(self, box: Box) -> NDArray[np.int32]:
+    def _window(self, box: Box) -> Int32Array:
         """The labels that affect a box, one and the softness more on each side; the border repeats itself."""
         around = 1 + self.softness
         columns, rows = (
@@ -137,7 +137,7 @@ def find_seams(survey: Survey, exposure: Exposure, graphcut: bool, workers: int 
 
 def _prepared(
     survey: Survey, exposure: Exposure | None, index: int
-) -> tuple[SurveyTile, Float32Array, NDArray[Any] | None]:
+) -> tuple[SurveyTile, Float32Array, AnyArray | None]:
     """A tile with its border weights, and its samples as exposed alike, if they are wanted."""
     tile = survey.tiles[index]
     assert tile is not None
@@ -149,22 +149,22 @@ def _prepared(
 
 
 def _cut(
-    inside: NDArray[np.bool_],
-    pixels: NDArray[Any],
-    below: NDArray[Any],
-    covered: NDArray[np.bool_],
+    inside: BoolArray,
+    pixels: AnyArray,
+    below: AnyArray,
+    covered: BoolArray,
     weight_fraction: Float32Array,
     *,
     in_pieces: bool,
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Where a new image, with its share of both border weights, replaces what lies below it.
 
     ``in_pieces``: in several places, one by one.
     """
     both = inside & covered
-    alone: NDArray[np.bool_] = inside & ~covered
+    alone: BoolArray = inside & ~covered
     free = both & (weight_fraction > _MIN_WEIGHT) & (weight_fraction < _MAX_WEIGHT)
-    surely_new: NDArray[np.bool_] = alone | (both & (weight_fraction >= _MAX_WEIGHT))
+    surely_new: BoolArray = alone | (both & (weight_fraction >= _MAX_WEIGHT))
     surely_old = covered & ~(surely_new | free)
     if not free.any():
         return surely_new
@@ -179,7 +179,7 @@ def _cut(
     return won
 
 
-def _parts(free: NDArray[np.bool_]) -> list[tuple[slice, slice]]:
+def _parts(free: BoolArray) -> list[tuple[slice, slice]]:
     """Where cuts are free to run, column by column: an image across the edge of a full turn has both ends."""
     columns = np.flatnonzero(free.any(axis=0))
     groups = np.split(columns, np.flatnonzero(np.diff(columns) > 2 * _AROUND_FREE + 1) + 1)
@@ -190,7 +190,7 @@ def _parts(free: NDArray[np.bool_]) -> list[tuple[slice, slice]]:
     return parts
 
 
-def _around(free: NDArray[np.bool_]) -> tuple[slice, slice]:
+def _around(free: BoolArray) -> tuple[slice, slice]:
     """The box in which a cut can run, with a margin that certainly belongs to either side."""
     rows, columns = (np.flatnonzero(free.any(axis=axis)) for axis in (1, 0))
     return (
@@ -199,7 +199,7 @@ def _around(free: NDArray[np.bool_]) -> tuple[slice, slice]:
     )
 
 
-def _visibility(first: NDArray[Any], second: NDArray[Any], weight_fraction: Float32Array) -> Float32Array:
+def _visibility(first: AnyArray, second: AnyArray, weight_fraction: Float32Array) -> Float32Array:
     """How much a seam shows at each pixel (h, w): the square of what two images differ by in brightness and in edges.
 
     One broken edge shows more than many small differences. ``weight_fraction``, the second image's of both border
@@ -214,7 +214,7 @@ def _visibility(first: NDArray[Any], second: NDArray[Any], weight_fraction: Floa
     return np.asarray(_VISIBLE**2 * np.minimum(shown**2 + aside**2, 1.0), dtype=np.float32)
 
 
-def _graph_cut(cost: Float32Array, masks: list[NDArray[np.uint8]]) -> NDArray[np.bool_]:
+def _graph_cut(cost: Float32Array, masks: list[UInt8Array]) -> BoolArray:
     """Where the second of two images wins; the pixels that one mask alone has are what the cut must separate.
 
     A large cut is found at half the size first, and then only moved by a few pixels. What the images differ by is
@@ -241,7 +241,7 @@ def _graph_cut(cost: Float32Array, masks: list[NDArray[np.uint8]]) -> NDArray[np
     return won
 
 
-def _near_cut(won: NDArray[np.bool_], masks: list[NDArray[np.uint8]]) -> list[NDArray[np.uint8]]:
+def _near_cut(won: BoolArray, masks: list[UInt8Array]) -> list[UInt8Array]:
     """Masks that leave free only what is near a cut found at half the size."""
     height, width = masks[0].shape
     above = np.repeat(np.repeat(won, 2, axis=0), 2, axis=1)[:height, :width].astype(np.uint8)

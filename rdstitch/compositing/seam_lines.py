@@ -12,9 +12,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.arrays import AnyArray, FloatArray, Int32Array, IntArray
 from rdstitch.compositing.boxes import Box
 
 # Pixels of images with a diagonal of 1000:
@@ -28,7 +27,7 @@ _CONTINUED = 0.4  # of its contrast that a line keeps beyond a seam
 class _Image:
     """An image on the canvas; its lines are found when they are needed."""
 
-    def __init__(self, box: Box, grey: NDArray[Any], full: float, min_length: float) -> None:
+    def __init__(self, box: Box, grey: AnyArray, full: float, min_length: float) -> None:
         self.box, self.grey, self._full, self._min_length = box, grey, full, min_length
 
     @cached_property
@@ -68,11 +67,11 @@ class SeamLines:
     ``labels`` (h, w) are the owners of the pixels of a reduced canvas, each ``label_size`` pixels long.
     """
 
-    def __init__(self, labels: NDArray[np.int32], label_size: float, reach: int) -> None:
+    def __init__(self, labels: Int32Array, label_size: float, reach: int) -> None:
         self._labels, self._label_size, self._reach = labels, label_size, reach
         self._images: dict[int, _Image] = {}
 
-    def add(self, owner: int, box: Box, grey: NDArray[Any], full: float, min_length: float) -> None:
+    def add(self, owner: int, box: Box, grey: AnyArray, full: float, min_length: float) -> None:
         """An image (h, w) on a box of the canvas, ``full`` grey levels from black to white, with its lines."""
         self._images[owner] = _Image(box, grey, full, min_length)
 
@@ -94,7 +93,7 @@ class SeamLines:
                 return True
         return False
 
-    def _owners(self, points: FloatArray) -> NDArray[np.int32]:
+    def _owners(self, points: FloatArray) -> Int32Array:
         rows, columns = self._labels.shape
         x, y = ((points + 0.5) / self._label_size).astype(np.intp).T
         return np.asarray(self._labels[np.clip(y, 0, rows - 1), np.clip(x, 0, columns - 1)])

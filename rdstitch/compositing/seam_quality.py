@@ -10,14 +10,13 @@ line of one image does not go on in the other: branches, shadows and pebbles hid
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
-from rdstitch.compositing.boxes import Box, Float32Array
+from rdstitch.arrays import AnyArray, BoolArray, Float32Array, FloatArray, Int32Array, IntArray
+from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.seam_lines import SeamLines
 from rdstitch.system.late_imports import csgraph
 
@@ -50,7 +49,7 @@ class SeamTile:
     """One image where seams are looked at."""
 
     box: Box  # on the canvas of the tiles
-    grey: NDArray[Any]  # (h, w): uint8 of images of 8 bits, else float32
+    grey: AnyArray  # (h, w): uint8 of images of 8 bits, else float32
     inside: BoolArray  # (h, w)
 
 
@@ -138,7 +137,7 @@ class SeamQuality:
 
 
 def measure_seams(
-    tiles: Sequence[SeamTile | None], labels: NDArray[np.int32], label_size: float, unit: float, full: float = 255.0
+    tiles: Sequence[SeamTile | None], labels: Int32Array, label_size: float, unit: float, full: float = 255.0
 ) -> SeamQuality:
     """Compare both sides of all seams.
 
@@ -181,7 +180,7 @@ def measure_seams(
     return SeamQuality((places + 0.5) * unit - 0.5, misfit, broken, misfits, breaks, _STEP * unit)
 
 
-def _border_places(labels: NDArray[np.int32], label_size: float) -> tuple[IntArray, FloatArray]:
+def _border_places(labels: Int32Array, label_size: float) -> tuple[IntArray, FloatArray]:
     """Pairs of owners (N, 2), ascending, and places of their borders (N, 2) on the canvas of the tiles."""
     borders = []
     for first, second, right, down in ((labels[:, :-1], labels[:, 1:], 0.5, 0.0), (labels[:-1], labels[1:], 0.0, 0.5)):
@@ -270,7 +269,7 @@ def _windows(tile: SeamTile, whole: IntArray) -> Float32Array:
     return np.asarray(np.lib.stride_tricks.sliding_window_view(tile.grey, (side, side))[y, x], dtype=np.float32)
 
 
-def _on_border(labels: NDArray[np.int32], label_size: float, pair: IntArray) -> Callable[[IntArray], BoolArray]:
+def _on_border(labels: Int32Array, label_size: float, pair: IntArray) -> Callable[[IntArray], BoolArray]:
     """Which pixels (N, side, side) of windows around places (N, 2) are near both owners."""
 
     def border(whole: IntArray) -> BoolArray:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import AnyArray, FloatArray
 from rdstitch.compositing.transparency import OPACITY_BYTES, filled, opacity
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
@@ -26,7 +26,7 @@ _PIXELS_PER_OUTPUT_PIXEL = 1.9
 _PROBE_REDUCTION = 8  # at which an image is read only to learn its samples and whether it is masked
 
 ImageLoader = Callable[[int], DecodedImage]
-"""Reads an image reduced by a factor, of which large ones are quicker; see :func:`rdstitch.io.read_image`."""
+"""Reads an image reduced by a factor, of which large ones are quicker; see :func:`rdstitch.io.read.read_image`."""
 
 Displacement = Callable[[FloatArray], FloatArray]
 """Displacement of an image's content, pixels (..., 2), at measured pixels (..., 2): what local alignment found."""
@@ -54,7 +54,7 @@ class LoadedImage:
     """An image ready to be resampled."""
 
     # (h, w) or (h, w, C): uint8, uint16 or float32; transparent pixels are filled from their nearest neighbours
-    pixels: NDArray[Any]
+    pixels: AnyArray
     # (h, w), uint16: 0 where the image is masked out, else rising to OPAQUE with the distance from the mask
     opacity: NDArray[np.uint16] | None = None
     opacity_step: float = 1.0  # opacity of the last opaque pixel beside a transparent one, as a share of OPAQUE
@@ -130,7 +130,7 @@ def block_side(shrink: float) -> int:
     return max(1, int(shrink / 2))
 
 
-def smoothed(pixels: NDArray[Any], shrink: float, reduction: int = 1) -> tuple[NDArray[Any], int]:
+def smoothed(pixels: AnyArray, shrink: float, reduction: int = 1) -> tuple[AnyArray, int]:
     """Pixels without what an output that shrinks them cannot show, and what they are smaller by than the original."""
     if (further := block_side(shrink / reduction)) > 1:
         pixels = block_mean(pixels, further)

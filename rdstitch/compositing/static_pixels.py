@@ -10,10 +10,8 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import BoolArray
-from rdstitch.compositing.boxes import Float32Array
+from rdstitch.arrays import AnyArray, BoolArray, Float32Array
 from rdstitch.io.reduction import mean_of_channels
 
 MIN_IMAGES = 4  # fewer may show the same by chance
@@ -26,7 +24,7 @@ _MIN_TEXTURE = 0.1  # of what is usual in the images, for corners to count
 _WINDOW = 0.05  # of the longer side, over which corners are compared
 
 
-def static_pixels(images: Sequence[NDArray[np.generic]]) -> BoolArray | None:
+def static_pixels(images: Sequence[AnyArray]) -> BoolArray | None:
     """Which pixels show what stays at its place in all images.
 
     The images, at least :data:`MIN_IMAGES` of one camera that moved between them, are some hundred pixels wide. None
@@ -66,8 +64,7 @@ def _tensor(slope: Float32Array) -> Float32Array:
 def _smaller_eigenvalue(tensor: Float32Array, window: int) -> Float32Array:
     """Smaller eigenvalue of the structure tensor (3, h, w), averaged over a window."""
     xx, yy, xy = (cv2.boxFilter(part, -1, (window, window)) for part in tensor)
-    smaller: Float32Array = (xx + yy) / 2.0 - np.sqrt(((xx - yy) / 2.0) ** 2 + xy**2)
-    return smaller
+    return np.asarray((xx + yy) / 2.0 - np.sqrt(((xx - yy) / 2.0) ** 2 + xy**2))
 
 
 def _with_captions(static: BoolArray, same: BoolArray, window: int) -> BoolArray:
@@ -89,7 +86,7 @@ def _with_captions(static: BoolArray, same: BoolArray, window: int) -> BoolArray
     return static | (cv2.dilate(captions.astype(np.uint8), np.ones((5, 5), dtype=np.uint8)) > 0)
 
 
-def _border(dark: NDArray[np.bool_], window: int) -> BoolArray:
+def _border(dark: BoolArray, window: int) -> BoolArray:
     """Regions at the edge that are dark in all images (N, h, w), and end where most of these are not.
 
     What is dark in all by chance (the ground of a microscope, a shadow) ends where the first of them is not.
@@ -107,7 +104,7 @@ def _border(dark: NDArray[np.bool_], window: int) -> BoolArray:
     return border
 
 
-def _regions(candidates: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _regions(candidates: BoolArray) -> BoolArray:
     """The connected regions that are large enough; grown by two pixels."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(candidates.astype(np.uint8))
     large = [k for k in range(1, count) if stats[k, cv2.CC_STAT_AREA] >= _MIN_AREA * candidates.size]

@@ -5,13 +5,12 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.compositing.boxes import Box, Float32Array, cut, intersection, overlapping_pairs
+from rdstitch.arrays import AnyArray, BoolArray, Float32Array, Int32Array, IntArray
+from rdstitch.compositing.boxes import Box, cut, intersection, overlapping_pairs
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.likeness import likeness
 from rdstitch.compositing.resample import sample, sample_opacity
@@ -30,8 +29,8 @@ class SurveyTile:
     """One image on the reduced canvas."""
 
     box: Box  # on the reduced canvas
-    pixels: NDArray[Any]  # (h, w, C): in the image's sample type
-    inside: NDArray[np.bool_]  # (h, w), bool
+    pixels: AnyArray  # (h, w, C): in the image's sample type
+    inside: BoolArray  # (h, w), bool
     opacity: Float32Array | None = None  # (h, w), float32: of an image with a mask
     seam_tile: SeamTile | None = None  # the same, larger, where seams are looked at
 
@@ -46,20 +45,20 @@ class Survey:
     tiles: tuple[SurveyTile | None, ...]  # None for an image that is nowhere opaque
     enlarged: float  # pixels of what seams are looked at on for one of the reduced canvas, along a side
 
-    def pairs(self) -> NDArray[np.intp]:
+    def pairs(self) -> IntArray:
         """Pairs (P, 2) of images that lie over each other; see :func:`overlapping_pairs`."""
         return overlapping_pairs([None if tile is None else tile.box for tile in self.tiles])
 
-    def overlap(self, i: int, j: int) -> tuple[SurveyTile, SurveyTile, Box, NDArray[np.bool_]]:
-        """The tiles of one of the pairs, the box that they have in common, and where both images show in it."""
+    def overlap(self, i: int, j: int) -> tuple[Box, BoolArray]:
+        """The box that the tiles of one of the pairs have in common, and where both images show in it."""
         a, b = self.tiles[i], self.tiles[j]
         assert a is not None
         assert b is not None
         box = intersection(a.box, b.box)
         assert box is not None
-        return a, b, box, cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
+        return box, cut(a.inside, a.box, box) & cut(b.inside, b.box, box)
 
-    def seam_quality(self, labels: NDArray[np.int32]) -> SeamQuality:
+    def seam_quality(self, labels: Int32Array) -> SeamQuality:
         """What seams are like, in canvas pixels; ``labels`` are the owners of the reduced canvas."""
         full = 255.0
         shown = [tile for tile in self.tiles if tile is not None]

@@ -6,13 +6,14 @@ image, one product and one sum.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rdstitch.compositing.boxes import Box, Float32Array, cut
+from rdstitch.arrays import AnyArray, Float32Array, UInt8Array
+from rdstitch.compositing.boxes import Box, cut
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.photometric import DEPTHS, full_scale
 from rdstitch.compositing.preparation import decide, prepare_composite
@@ -24,8 +25,6 @@ from rdstitch.options.composite_options import CompositeOptions
 
 @dataclass(frozen=True, eq=False)
 class _Share:
-    """What one image gives to a box of the output."""
-
     index: int
     box: Box
     places: tuple[NDArray[np.int16], NDArray[np.uint16]]
@@ -37,7 +36,7 @@ class _Share:
 class CompositeTables:
     """Everything about a composite but the samples of its images."""
 
-    alpha: NDArray[np.uint8]  # (H, W), uint8: 255 where an image lies, else 0
+    alpha: UInt8Array  # (H, W), uint8: 255 where an image lies, else 0
     _sizes: tuple[tuple[int, int], ...]
     _shrinks: tuple[float, ...]
     _shares: tuple[_Share, ...]
@@ -74,7 +73,7 @@ class CompositeTables:
             sizes = tuple(image.camera.image_size for image in images)
             return cls(covered, sizes, shrinks, tuple(shares), offset, kernel)
 
-    def compose(self, images: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    def compose(self, images: Sequence[AnyArray]) -> AnyArray:
         """Put a set of images together.
 
         In the order of those that the tables were made for, (H, W) or (H, W, C), each of the size of its camera. Of
@@ -102,7 +101,7 @@ class CompositeTables:
         done = cv2.subtract(total, 0.0, dtype=DEPTHS[first.dtype.name])  # type: ignore[call-overload]
         return np.asarray(done).reshape(height, width, *first.shape[2:])
 
-    def check(self, images: Sequence[NDArray[Any]]) -> None:
+    def check(self, images: Sequence[AnyArray]) -> None:
         """Refuse images that the tables are not for."""
         if len(images) != len(self._sizes):
             raise ArgumentError(f"expected {len(self._sizes)} images, not {len(images)}")

@@ -15,15 +15,15 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.render import Renderer
 from rdstitch.io.strips import STRIP_ROWS
 from rdstitch.system.cache import Cache, Stored
-from rdstitch.system.progress import FractionProgress, no_progress
+from rdstitch.system.progress import FractionProgress, silent
 
-OutputStrip = tuple[NDArray[Any], NDArray[np.uint8]]
+OutputStrip = tuple[AnyArray, UInt8Array]
 """Samples (h, W, C) and alpha (h, W)."""
 
 
@@ -61,7 +61,7 @@ class TiledOutput:
         renderer, images = self.renderer.part(box, self.workers)
         return TiledOutput(renderer, box, self.tile_size, 1), images
 
-    def strips(self, progress: FractionProgress = no_progress) -> Generator[OutputStrip]:
+    def strips(self, progress: FractionProgress = silent) -> Generator[OutputStrip]:
         """The output from top to bottom: samples (h, W, C) and alpha (h, W), at most 256 rows at a time."""
         if self.workers == 1:
             yield from self._strips(map, progress)

@@ -4,13 +4,12 @@ All is computed some rows at a time.
 """
 
 from collections.abc import Iterator
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-BoolImage = NDArray[np.bool_]
+from rdstitch.arrays import AnyArray, BoolArray
 
 OPAQUE = 65535  # opacity of what is far from all transparent pixels
 OPACITY_BYTES = 2  # bytes of a pixel's opacity
@@ -22,7 +21,7 @@ _REACH = 64
 _FEATHER = 0.125
 
 
-def filled(pixels: NDArray[Any], opaque: BoolImage) -> NDArray[Any]:
+def filled(pixels: AnyArray, opaque: BoolArray) -> AnyArray:
     """Every transparent pixel gets the value of the nearest opaque one, so that no kernel mixes in its colour.
 
     Far from all opaque pixels it gets that of some opaque one.
@@ -49,7 +48,7 @@ def filled(pixels: NDArray[Any], opaque: BoolImage) -> NDArray[Any]:
     return result
 
 
-def opacity(opaque: BoolImage) -> tuple[NDArray[np.uint16], float]:
+def opacity(opaque: BoolArray) -> tuple[NDArray[np.uint16], float]:
     """Weight that rises from a mask's border to OPAQUE, and its value at the first opaque pixel, as a share of that."""
     reach = max(2.0, _FEATHER * min(opaque.shape))
     weight = np.empty(opaque.shape, dtype=np.uint16)
@@ -68,7 +67,7 @@ def _windows(height: int, reach: int) -> Iterator[tuple[slice, slice]]:
         yield slice(top, bottom), slice(max(0, top - reach), min(bottom + reach, height))
 
 
-def _from_nearest(pixels: NDArray[Any], opaque: BoolImage, rows: slice) -> NDArray[Any]:
+def _from_nearest(pixels: AnyArray, opaque: BoolArray, rows: slice) -> AnyArray:
     """Some rows of a part of an image that has opaque pixels, where it is transparent with those of the nearest."""
     hidden = (~opaque).view(np.uint8)
     _, labels = cv2.distanceTransformWithLabels(hidden, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)

@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import Camera, points_over
 from rdstitch.io.read import DecodedImage
 
@@ -48,7 +47,7 @@ class VisibleRegion:
         kept = border[: last + 1][inside[: last + 1]]
         return np.concatenate([kept, measured[np.isfinite(measured).all(axis=1)]])
 
-    def shows(self, points: FloatArray) -> NDArray[np.bool_]:
+    def shows(self, points: FloatArray) -> BoolArray:
         """Which measured pixels (K, 2) are drawn."""
         with np.errstate(invalid="ignore"):
             return np.asarray(self._value(self.camera.normalize(self.camera.undistort(points))) > 0.0)
@@ -56,15 +55,10 @@ class VisibleRegion:
     def masked(self, image: DecodedImage) -> DecodedImage:
         """The image, whole or reduced, with the rest transparent."""
         height, width = image.pixels.shape[:2]
-        shown = self._shown(width, height)
-        alpha = np.where(shown, np.uint8(255) if image.alpha is None else image.alpha, np.uint8(0))
-        return replace(image, alpha=alpha)
-
-    def _shown(self, width: int, height: int) -> NDArray[np.bool_]:
-        """Which pixels of the image at a size are drawn; in measured coordinates the limit is a conic."""
         camera = self.camera.resized((width, height))
         x = (np.arange(width) - camera.center[0]) / camera.scale
         shown = np.empty((height, width), dtype=np.bool_)
+        # In measured coordinates the limit is a conic.
         for top in range(0, height, _ROWS):
             y = ((np.arange(top, min(top + _ROWS, height)) - camera.center[1]) / camera.scale)[:, None]
             radius2 = x**2 + y**2
@@ -73,18 +67,16 @@ class VisibleRegion:
                 lens *= radius2
                 lens += coefficient
             shown[top : top + _ROWS] = self.depth[0] * x + self.depth[1] * y + self.depth[2] * lens > 0.0
-        return shown
+        return replace(image, alpha=np.where(shown, np.uint8(255) if image.alpha is None else image.alpha, np.uint8(0)))
 
     def _value(self, flat: FloatArray) -> FloatArray:
         """What is positive where undistorted points (K, 2) are drawn."""
-        value: FloatArray = flat @ self.depth[:2] + self.depth[2]
-        return value
+        return np.asarray(flat @ self.depth[:2] + self.depth[2])
 
     def _crossing(self, inside: FloatArray, outside: FloatArray) -> FloatArray:
         """Where the line between two undistorted points meets the limit."""
         a, b = self._value(np.stack([inside, outside]))
-        crossing: FloatArray = inside + (outside - inside) * (a / (a - b))
-        return crossing
+        return np.asarray(inside + (outside - inside) * (a / (a - b)))
 
 
 def visible_regions(

@@ -4,13 +4,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
-from rdstitch.compositing.boxes import Box, Float32Array, encloses, grown, intersection
+from rdstitch.arrays import AnyArray, BoolArray, Float32Array, FloatArray
+from rdstitch.compositing.boxes import Box, encloses, grown, intersection
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.lattice import LATTICE_STEPS, Lattice
 from rdstitch.compositing.projection import PLANE, Projection
@@ -77,10 +76,10 @@ class Warp:
             return replace(finer, from_canvas=self.from_canvas @ back)
         return replace(finer, surface=replace(self.surface, from_canvas=self.surface.from_canvas @ back))
 
-    def contains(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.bool_]:
+    def contains(self, x: AnyArray, y: AnyArray) -> BoolArray:
         """Which measured pixels lie in the image; NaN does not."""
         width, height = self.camera.image_size
-        within: NDArray[np.bool_] = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
+        within: BoolArray = (x >= -0.5) & (x < width - 0.5) & (y >= -0.5) & (y < height - 0.5)
         if (radius := self.camera.drawn_radius) < math.inf:
             within &= (x - self.camera.center[0]) ** 2 + (y - self.camera.center[1]) ** 2 <= radius**2
         return within
@@ -113,7 +112,7 @@ class Geometry:
         return drawn and bool((points >= 0).all() and (points <= limit).all())
 
     @cached_property
-    def inside(self) -> NDArray[np.bool_]:
+    def inside(self) -> BoolArray:
         """Which pixels (h, w) lie in the image."""
         return np.ones(self.shape, dtype=np.bool_) if self.filled else self.warp.contains(*self.maps)
 
@@ -145,17 +144,16 @@ def plan_warp(
 
 
 def _measured(draft: Warp, probes: FloatArray, canvas: Canvas) -> Warp:
-    """The warp with its box, and with the spacing and the shrinkage at canvas pixels all over the image."""
-    draft = replace(draft, shrink=_shrink(draft, probes))
-    return replace(draft, box=_reached(draft, canvas), step=_lattice_step(draft, probes))
+    """The warp with the spacing and the shrinkage at canvas pixels all over the image, and with room in its box.
 
-
-def _reached(warp: Warp, canvas: Canvas) -> Box:
-    """The warp's box with room for what a displacement moves beyond it."""
+    That is for what a displacement moves beyond it.
+    """
+    warp = replace(draft, shrink=_shrink(draft, probes))
+    warp, box = replace(warp, step=_lattice_step(warp, probes)), warp.box
     if warp.displacement is None:
-        return warp.box
+        return warp
     moved = np.abs(warp.displacement(warp.camera.outline(_PROBES))).max() / warp.shrink
-    return intersection(grown(warp.box, int(np.ceil(moved)) + 1), (0, 0, *canvas.size)) or warp.box
+    return replace(warp, box=intersection(grown(box, int(np.ceil(moved)) + 1), (0, 0, *canvas.size)) or box)
 
 
 def plan_warps(images: Sequence[PlacedImage], canvas: Canvas) -> list[Warp]:

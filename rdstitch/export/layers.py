@@ -2,13 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.compositing.boxes import intersection
 from rdstitch.compositing.preparation import decide, prepare_composite
 from rdstitch.errors import OutputError
@@ -81,40 +79,31 @@ def stage_layers(result: OutputImage, files: Mapping[str, tuple[Path, Path]], ou
     task = decide(images, result.canvas, replace(result.options.composite, crop="none"))
     with prepare_composite(task) as tiles:
         canvas = tiles.box
-        size = canvas[2] - canvas[0], canvas[3] - canvas[1]
         for index, (source, warp) in enumerate(zip(result.placed.sources, tiles.renderer.warps, strict=True)):
             box = canvas if whole else intersection(warp.box, canvas) or canvas
             samples, covered, mask = tiles.renderer.layer(index, box)
-            offset = box[0] - canvas[0], box[1] - canvas[1]
-            shift = np.array([[1.0, 0.0, -offset[0]], [0.0, 1.0, -offset[1]], [0.0, 0.0, 1.0]])
-            tags = () if result.georeference is None else result.georeference.after(shift).tiff_tags()
-            write = partial(_write_cropped_tiff, offset=offset, size=size, extra_tags=tags)
-            alpha, shown = (as_alpha(where) for where in (covered, mask))
+            x, y = box[0] - canvas[0], box[1] - canvas[1]
+            shift = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 1.0]])
+            tags: list[ExtraTag] = [
+                (_X_POSITION, _RATIONAL, 1, (x, _DPI), True),
+                (_Y_POSITION, _RATIONAL, 1, (y, _DPI), True),
+                (_FULL_WIDTH, _LONG, 1, canvas[2] - canvas[0], True),
+                (_FULL_LENGTH, _LONG, 1, canvas[3] - canvas[1], True),
+            ]
+            tags += [] if result.georeference is None else result.georeference.after(shift).tiff_tags()
             layer, mask_file = files[source.name]
             with outputs.writing(layer) as staged:
-                write(staged, samples, alpha)
+                _write_tiff(staged, samples, as_alpha(covered), tags)
             with outputs.writing(mask_file) as staged:
-                write(staged, shown, None)
+                _write_tiff(staged, as_alpha(mask)[..., None], None, tags)
 
 
-def _write_cropped_tiff(
-    path: Path,
-    pixels: NDArray[Any],
-    alpha: NDArray[np.uint8] | None,
-    offset: tuple[int, int],
-    size: tuple[int, int],
-    extra_tags: Sequence[ExtraTag] = (),
-) -> None:
-    """Write a part (h, w) or (h, w, C) of a canvas of ``size``, its first pixel at ``offset``; alpha is 0 or 255."""
-    samples = pixels[..., None] if pixels.ndim == 2 else pixels
+def _write_tiff(path: Path, samples: AnyArray, alpha: UInt8Array | None, tags: Sequence[ExtraTag]) -> None:
+    """Write samples (h, w, C), and alpha (h, w), which is 0 or 255."""
     colours = 3 if samples.shape[2] == 3 else 1
     extra = ["unspecified"] * (samples.shape[2] - colours)
     if alpha is not None:
         samples, extra = with_alpha(samples, alpha), [*extra, "unassalpha"]
-    positions = [
-        (tag, _RATIONAL, 1, (at, _DPI), True) for tag, at in zip((_X_POSITION, _Y_POSITION), offset, strict=True)
-    ]
-    full_size = [(tag, _LONG, 1, side, True) for tag, side in zip((_FULL_WIDTH, _FULL_LENGTH), size, strict=True)]
     tifffile.imwrite(
         path,
         samples if extra else samples[..., 0] if colours == 1 else samples,
@@ -125,7 +114,7 @@ def _write_cropped_tiff(
         predictor=samples.dtype.kind == "u",
         resolution=(_DPI, _DPI),
         resolutionunit="inch",
-        extratags=[*positions, *full_size, *extra_tags],
+        extratags=tags,
         metadata=None,
         software=False,
     )

@@ -15,9 +15,10 @@ from rdstitch.arrays import FloatArray
 from rdstitch.compositing.plan import default_memory
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.geometry.path_frames import AXES
-from rdstitch.io import ImageSpec, write_strips
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import read_image
+from rdstitch.io.strips import ImageSpec
+from rdstitch.io.write import write_strips
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs, text_bytes
 from rdstitch.trajectories.trajectory import Trajectory

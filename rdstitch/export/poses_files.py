@@ -18,9 +18,9 @@ from rdstitch.arrays import FloatArray
 from rdstitch.choices import PosesFrame
 from rdstitch.errors import ArgumentError
 from rdstitch.export.trajectory_files import as_csv
-from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import rigid_in_plane, rotation_from_tilt
 from rdstitch.georeferencing.georeference import Georeference
+from rdstitch.inputs.frame import frame_numbers
 from rdstitch.inputs.times import timestamps_of
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.late_imports import spatial
@@ -40,7 +40,7 @@ def poses_table(result: StitchResult, frame: PosesFrame = "enu", height: float =
         poses, to_map, place = _poses_and_map(result, "leave out --frame map")
         path = Trajectory.on_map(poses, to_map, place.map_scale)
     sources = registration.sources
-    numbers = [source.number(k) for k, source in enumerate(sources)]
+    numbers = frame_numbers([source.frame for source in sources])
     path = path.labelled([source.name for source in sources], numbers, timestamps_of(sources))
     return as_csv(path, "enu" if frame == "map" else frame)
 
@@ -70,7 +70,8 @@ def poses_file(result: StitchResult, file: str | Path, frame: PosesFrame = "enu"
         return _geo_of_opendronemap(result)
     if poses is None:
         raise ArgumentError(f"{file}: one homography per image has no poses; --model pose gives some")
-    if len({_lens(camera) for camera in result.placed.cameras}) > 1:
+    lenses = {(c.image_size, c.center, c.focal, c.coefficients, c.lens_model) for c in result.placed.cameras}
+    if len(lenses) > 1:
         raise ArgumentError(f"{file}: the images are of several cameras or sizes, and there they have the same one")
     to_map = None if result.georeference is None else _poses_and_map(result, "leave out --straighten")[1]
     return _images_of_colmap([source.name for source in result.registration.sources], poses, to_map)
@@ -91,11 +92,6 @@ def _geo_of_opendronemap(result: StitchResult) -> str:
         if np.isfinite(centre).all()
     ]
     return "\n".join([f"EPSG:{place.crs.epsg}", *rows]) + "\n"
-
-
-def _lens(camera: Camera) -> tuple[object, ...]:
-    """What a camera of COLMAP has."""
-    return camera.image_size, camera.center, camera.focal, camera.coefficients, camera.lens_model
 
 
 def _images_of_colmap(names: Sequence[str], poses: PlanarPoses, to_map: FloatArray | None) -> str:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.features.keypoints import Correspondences, Detection, Features
 from rdstitch.options.feature_options import FeatureOptions
-from rdstitch.system.opencv_state import silent_opencv
+from rdstitch.system.native_threads import silent_opencv
 
 
 def detect_aliked(grey: NDArray[np.uint8], options: FeatureOptions) -> Detection:

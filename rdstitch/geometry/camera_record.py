@@ -12,7 +12,7 @@ from rdstitch.choices import FocalSource
 from rdstitch.geometry.camera import FOCAL_LOG_STD, Camera
 from rdstitch.geometry.lens_model import LensModel
 from rdstitch.system.file_access import read_text
-from rdstitch.system.output_checks import check_output
+from rdstitch.system.output_checks import check_outputs, check_suffix
 from rdstitch.system.outputs import json_bytes, write_bytes_atomic
 from rdstitch.system.records import NonNegative, Pair, Size, Triple, convert, parse_json, to_jsonable
 
@@ -145,7 +145,7 @@ def camera_json(camera: Camera) -> dict[str, Any]:
 
 def save_own(camera: Camera, path: str | Path) -> None:
     """Write a camera file."""
-    check_output(path, overwrite=True, suffixes=(".json",))
+    check_outputs([check_suffix(path, (".json",))], overwrite=True)
     write_bytes_atomic(path, json_bytes(camera_json(camera)))
 
 

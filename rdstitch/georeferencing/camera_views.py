@@ -6,13 +6,11 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, ComplexArray, FloatArray, IntArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import to_plane
-
-ComplexArray = NDArray[np.complex128]
 
 _TILT_STD = math.radians(3.0)  # of a camera that is taken to look straight down, and of an attitude
 _METRIC = 1e-4  # by which the axes of a plane seen from above differ, of their length: rounding
@@ -84,8 +82,7 @@ def _below(camera: Camera, nadir: tuple[float, float, float] | None) -> FloatArr
     """The pixel straight below a camera by its attitude; None where that is not known or not ahead."""
     if nadir is None or camera.focal is None or nadir[2] <= 0.0:
         return None
-    pixel: FloatArray = camera.distort(np.array([camera.center]) + np.array([nadir[:2]]) / nadir[2] * camera.focal)[0]
-    return pixel
+    return np.asarray(camera.distort(np.array([camera.center]) + np.array([nadir[:2]]) / nadir[2] * camera.focal)[0])
 
 
 def _centres(cameras: Sequence[Camera], focal: FloatArray, to_output: FloatArray) -> FloatArray | None:

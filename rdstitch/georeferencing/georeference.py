@@ -130,8 +130,7 @@ class Georeference:
     def to_map(self, points: ArrayLike) -> FloatArray:
         """Easting and northing (N, 2), m, of pixels (N, 2) of the output."""
         matrix = self.pixel_to_map
-        places: FloatArray = np.asarray(points, dtype=np.float64) @ matrix[:, :2].T + matrix[:, 2]
-        return places
+        return np.asarray(np.asarray(points, dtype=np.float64) @ matrix[:, :2].T + matrix[:, 2])
 
     def tiff_tags(self) -> list[ExtraTag]:
         """What makes a TIFF file a GeoTIFF."""

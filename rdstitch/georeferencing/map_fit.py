@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rdstitch.arrays import BoolArray, FloatArray
-from rdstitch.georeferencing.camera_views import ComplexArray, Views
+from rdstitch.arrays import BoolArray, ComplexArray, FloatArray
+from rdstitch.georeferencing.camera_views import Views
 from rdstitch.robust.similarity_fit import OUTLYING, fit_similarity
 
 SLOPE_STD = math.radians(1.0)  # of the ground: level to gently sloping in the classes of the FAO (up to 5 %)
@@ -72,14 +72,13 @@ class Measured:
 def fit_map(views: Views, measured: Measured) -> MapFit:
     """Fit measured places; the ground is level unless they clearly show that it slopes."""
     level = _fitted(views, measured, 0.0)
-    if level is None or not _has_altitudes(views, measured.altitude).any():
-        return level or _no_fit(len(measured.places))
+    if level is None:
+        count = len(measured.places)
+        return MapFit(0.0, 0.0, np.full(count, complex(np.inf)), np.zeros(count, dtype=bool), None)
+    if not _has_altitudes(views, measured.altitude).any():
+        return level
     sloping = _fitted(views, measured, SLOPE_STD)
     return sloping if sloping is not None and sloping.slope_squared > _SHOWN**2 else level
-
-
-def _no_fit(count: int) -> MapFit:
-    return MapFit(0.0, 0.0, np.full(count, complex(np.inf)), np.zeros(count, dtype=bool), None)
 
 
 def _fitted(views: Views, measured: Measured, slope_std: float) -> MapFit | None:
@@ -122,8 +121,6 @@ class _Trust(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """A solution of the equations."""
-
     solution: FloatArray  # (P,)
     covariance: FloatArray  # (P, P)
     residual: FloatArray  # (N, 3): east, north, altitude

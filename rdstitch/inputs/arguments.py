@@ -13,8 +13,7 @@ from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame, Named
 from rdstitch.inputs.image_folders import READABLE_SUFFIXES, images_in, is_raw_or_heif, natural_key, place_of
 from rdstitch.inputs.keyframes import wanted_frames
-from rdstitch.inputs.rosbag import is_bag
-from rdstitch.inputs.rosbag_images import extract_images
+from rdstitch.inputs.rosbag import extract_images, is_bag
 from rdstitch.io.opening import HEIF_SUFFIXES
 from rdstitch.io.video import VIDEO_SUFFIXES, extract_frames, grey_frames
 from rdstitch.results.messages import Message, shortened

@@ -1,8 +1,9 @@
 """Measured tilts of images: of their XMP, of a table by name, or of an IMU by time, between which is interpolated."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,7 @@ def with_attitudes(sources: Sequence[Source], wanted: str | Path | None) -> list
         return list(sources)
     if wanted == XMP:
         return _of_images(sources)
-    attitudes = _read_attitudes(wanted).of(sources)
+    attitudes = _read_attitudes(wanted)(sources)
     return [replace(source, attitude=attitude) for source, attitude in zip(sources, attitudes, strict=True)]
 
 
@@ -69,65 +70,45 @@ def _of_images(sources: Sequence[Source]) -> list[Source]:
     return measured
 
 
-@dataclass(frozen=True, eq=False)
-class _AttitudesByName:
-    """Attitudes by the names of images."""
-
-    file: str | Path
-    rows: RowsByImage
-
-    def of(self, sources: Sequence[Source]) -> list[MeasuredTilt]:
-        """Tilts of images, each of which the table must name."""
-        rows = self.rows.needed(sources, self.file, "psi and theta")
-        return [
-            MeasuredTilt(turned_tilt(_tilt_of(row), turning_matrix(source.metadata.orientation)))
-            for source, row in zip(sources, rows, strict=True)
-        ]
+def _by_name(file: str | Path, rows: RowsByImage, sources: Sequence[Source]) -> list[MeasuredTilt]:
+    """Tilts of images, each of which the table must name."""
+    return [
+        MeasuredTilt(turned_tilt(_tilt_of(row), turning_matrix(source.metadata.orientation)))
+        for source, row in zip(sources, rows.needed(sources, file, "psi and theta"), strict=True)
+    ]
 
 
-@dataclass(frozen=True, eq=False)
-class _AttitudesByTime:
-    """Attitudes by time, as an IMU measures them at its own rate."""
-
-    file: str | Path
-    times: FloatArray  # (M,), s, ascending
-    tilts: FloatArray  # (M, 2): (ψ, θ), radians
-
-    def of(self, sources: Sequence[Source]) -> list[MeasuredTilt]:
-        """Tilts of images, whose times must lie within the table, interpolated at :data:`DELAYS`."""
-        return [
-            self._of_one(source, time) for source, time in zip(sources, timestamps_of(sources).tolist(), strict=True)
-        ]
-
-    def _of_one(self, source: Source, time: float) -> MeasuredTilt:
-        first, last = self.times[[0, -1]].tolist()
-        beyond = float(np.median(np.diff(self.times))) if len(self.times) > 1 else 0.0
+def _by_time(file: str | Path, times: FloatArray, tilts: FloatArray, sources: Sequence[Source]) -> list[MeasuredTilt]:
+    """Tilts of images between those (M, 2) that an IMU has measured at times (M,), s, ascending, at :data:`DELAYS`."""
+    first, last = times[[0, -1]].tolist()
+    beyond = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    measured = []
+    for source, time in zip(sources, timestamps_of(sources).tolist(), strict=True):
         if math.isnan(time):
-            raise InputError(f"{source.path}: has no time, and {self.file} has attitudes by time; give --timestamps")
+            raise InputError(f"{source.path}: has no time, and {file} has attitudes by time; give --timestamps")
         if not first - beyond <= time <= last + beyond:
             raise InputError(
-                f"{self.file}: has attitudes from {first:.3f} to {last:.3f} s, not for {source.name}, {time:.3f} s"
+                f"{file}: has attitudes from {first:.3f} to {last:.3f} s, not for {source.name}, {time:.3f} s"
             )
-        if in_gap(self.times, np.array([time]))[0]:
-            raise InputError(
-                f"{self.file}: has no attitudes for a long time before and after {source.name}, {time:.3f} s"
-            )
+        if in_gap(times, np.array([time]))[0]:
+            raise InputError(f"{file}: has no attitudes for a long time before and after {source.name}, {time:.3f} s")
         turn = turning_matrix(source.metadata.orientation)
-        rows = np.stack([np.interp(time + DELAYS, self.times, values) for values in self.tilts.T], axis=1)
-        tilts = [turned_tilt((psi, theta), turn) for psi, theta in rows.tolist()]
-        return MeasuredTilt(tilts[len(DELAYS) // 2], np.array(tilts))
+        rows = np.stack([np.interp(time + DELAYS, times, values) for values in tilts.T], axis=1)
+        at_delays = [turned_tilt((psi, theta), turn) for psi, theta in rows.tolist()]
+        measured.append(MeasuredTilt(at_delays[len(DELAYS) // 2], np.array(at_delays)))
+    return measured
 
 
 @cached_by_file_state
-def _read_attitudes(file: str | Path) -> _AttitudesByName | _AttitudesByTime:
+def _read_attitudes(file: str | Path) -> Callable[[Sequence[Source]], list[MeasuredTilt]]:
     wanted = ("name,psi,theta", "timestamp,psi,theta", "timestamp,qx,qy,qz,qw")
     rows = csv_rows(read_text(file), str(file), _COLUMNS, wanted, _UNITS)
     tilts = [_tilt_of(row) for row in rows]
     if any("name" in row.values for row in rows):
-        return _AttitudesByName(file, RowsByImage(rows))
+        return partial(_by_name, file, RowsByImage(rows))
     times = np.array([row.needed("timestamp") for row in rows])
     order = np.argsort(times, kind="stable")
-    return _AttitudesByTime(file, times[order], np.array(tilts).reshape(-1, 2)[order])
+    return partial(_by_time, file, times[order], np.array(tilts).reshape(-1, 2)[order])
 
 
 def _tilt_of(row: Row) -> tuple[float, float]:

@@ -34,18 +34,9 @@ class FoundImages:
     @property
     def messages(self) -> list[Message]:
         """Messages on what was not taken."""
-        if not self.outputs:
-            return [*self.notes]
-        paths = [str(path) for path in self.outputs]
-        names = shortened(names_of(paths))
-        return [
-            *self.notes,
-            Message(
-                f"not taken as input, since sidecars say that rdstitch wrote them: {names}",
-                tuple(paths),
-                code="own-output",
-            ),
-        ]
+        paths = tuple(map(str, self.outputs))
+        text = f"not taken as input, since sidecars say that rdstitch wrote them: {shortened(names_of(paths))}"
+        return [*self.notes, *([Message(text, paths, code="own-output")] if paths else [])]
 
 
 @contextmanager

@@ -9,8 +9,8 @@ from typing import Any, get_args
 import cv2
 import numpy as np
 import PIL.Image
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray
 from rdstitch.choices import ChannelOrder
 from rdstitch.errors import ArgumentError
 from rdstitch.io.metadata import Metadata, metadata_of
@@ -54,12 +54,12 @@ class Frame:
         return self.image.load() if isinstance(self.image, DeferredImage) else self.image
 
 
-def frame_numbers(listed: Sequence[Frame]) -> list[int]:
+def frame_numbers(listed: Sequence[Frame | None]) -> list[int]:
     """The number of each in its video, bag or list of arrays, else its place among all that are listed."""
-    return [place if frame.number is None else frame.number for place, frame in enumerate(listed)]
+    return [place if frame is None or frame.number is None else frame.number for place, frame in enumerate(listed)]
 
 
-Image = str | os.PathLike[str] | NDArray[Any] | PIL.Image.Image
+Image = str | os.PathLike[str] | AnyArray | PIL.Image.Image
 """A file, whatever else stands for files (see :mod:`rdstitch.inputs.find`), or an image in memory."""
 
 Images = Image | Iterable[Image | Frame]
@@ -88,7 +88,7 @@ def as_inputs(images: Images, channel_order: ChannelOrder = "bgr") -> list[Named
     return [_as_input(item, index, channel_order) for index, item in enumerate(listed)]
 
 
-def to_channel_order(samples: NDArray[Any], channel_order: ChannelOrder) -> NDArray[Any]:
+def to_channel_order(samples: AnyArray, channel_order: ChannelOrder) -> AnyArray:
     """Samples (H, W), (H, W, C) in RGB order in the order wanted, or the other way round."""
     if channel_order == "rgb" or samples.ndim == 2 or samples.shape[2] != 3:
         return samples
@@ -119,7 +119,7 @@ def _as_input(item: Any, index: int, channel_order: ChannelOrder) -> Named:
     return Frame(Path(name), index, image=array_as_image(name, item, channel_order))
 
 
-def array_as_image(name: str, array: NDArray[Any], channel_order: ChannelOrder) -> DecodedImage:
+def array_as_image(name: str, array: AnyArray, channel_order: ChannelOrder) -> DecodedImage:
     """An array as the readers of files give it: in RGB order, alpha apart, and a copy, since buffers are reused."""
     if array.ndim not in (2, 3) or array.size == 0:
         raise ArgumentError(f"{name}: expected an array of shape (H, W) or (H, W, C), not {array.shape}")

@@ -14,8 +14,7 @@ import cv2
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.frame import Frame, Named, array_as_image
 from rdstitch.inputs.growing_folder import GrowingFolder
-from rdstitch.inputs.rosbag import is_bag
-from rdstitch.inputs.rosbag_images import images_in_bag
+from rdstitch.inputs.rosbag import images_in_bag, is_bag
 from rdstitch.io.video import VIDEO_SUFFIXES, grabbed_frames, opened_capture, write_frame
 
 _POLL_SECONDS = 0.2
@@ -93,7 +92,6 @@ def _of_names(names: IO[str], idle: float | None, kept: list[Named]) -> Iterator
 
 
 def _read_lines(stream: IO[str], read: "queue.Queue[str | None]") -> None:
-    """Hand on the lines of a stream, and None at its end."""
     try:
         # As bytes where there are any: names of files need not be UTF-8.
         for line in getattr(stream, "buffer", stream):

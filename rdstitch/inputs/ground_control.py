@@ -84,8 +84,6 @@ def with_ground_control(
 
 
 class _Mark(NamedTuple):
-    """A point in an image."""
-
     image: int  # its index
     point: str
     place: Coordinates
@@ -94,7 +92,6 @@ class _Mark(NamedTuple):
 
 
 def _marks(rows: Iterable[Row], sources: Sequence[Source]) -> list[_Mark]:
-    """The points in these images."""
     marks, names = [], ImagesByName(sources)
     for row in rows:
         images, point = _images_and_point(row, names)

@@ -13,9 +13,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import BoolArray, FloatArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray, UInt8Array
 from rdstitch.features.corner_flow import CornerFlow, corners_of
 from rdstitch.features.prepared_image import PreparedImage
 from rdstitch.results.messages import Message
@@ -38,9 +37,9 @@ class FramePlaces:
 
     size: FloatArray  # (2,): of a frame, pixels of its small version
     places: FloatArray  # (N, 3, 3): from each frame to what all frames of its track have in common; affine
-    track: NDArray[np.intp]  # (N,), intp: number of the track; one ends where a frame cannot be found again in the next
+    track: IntArray  # (N,), intp: number of the track; one ends where a frame cannot be found again in the next
 
-    def seen_by(self, frames: NDArray[np.intp], other: int) -> BoolArray:
+    def seen_by(self, frames: IntArray, other: int) -> BoolArray:
         """Mark the points of a grid in some frames that another frame shows, (M, P)."""
         axis = (np.arange(_GRID) + 0.5) / _GRID
         points = np.stack([*np.meshgrid(*(axis * side for side in self.size)), np.ones((_GRID, _GRID))]).reshape(3, -1)
@@ -54,13 +53,15 @@ class FramePlaces:
         return float(min(self.seen_by(pair[1:], first).mean(), self.seen_by(pair[:1], second).mean()))
 
 
-def tracked(frames: Iterable[NDArray[np.uint8]]) -> FramePlaces:
+def tracked(frames: Iterable[UInt8Array]) -> FramePlaces:
     """Follow the frames of a video, grey (H, W), from the first to the last."""
     places: list[FloatArray] = []
     track: list[int] = []
     size, flow, begun_at = (1, 1), CornerFlow(), np.eye(3)
     for frame in frames:
-        small = _small(frame)
+        small, factor = frame, _SIDE / max(frame.shape)
+        if factor < 1.0:
+            small = np.asarray(cv2.resize(frame, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
         size = small.shape[1], small.shape[0]
         image = PreparedImage(small, None, np.ones(2), size)
         matched = flow.follow(image)
@@ -98,14 +99,6 @@ def fitted_affine(target: FloatArray, source: FloatArray, threshold: float) -> t
     return np.asarray(motion, dtype=np.float64), inliers
 
 
-def _small(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A frame no longer than ``_SIDE``."""
-    factor = _SIDE / max(frame.shape)
-    if factor >= 1.0:
-        return frame
-    return np.asarray(cv2.resize(frame, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-
-
 @dataclass(frozen=True)
 class FrameSelection:
     """The frames of a video that are wanted."""
@@ -126,13 +119,13 @@ class FrameSelection:
         return [Message(f"{used}; --every 1 takes all", (str(path),), "note", code="frames-passed-over")]
 
 
-def wanted_frames(every: int | None, grey: Callable[[], Iterable[NDArray[np.uint8] | None]]) -> FrameSelection:
+def wanted_frames(every: int | None, grey: Callable[[], Iterable[UInt8Array | None]]) -> FrameSelection:
     """Every n-th frame of a video; with None those that show new ground, by all of its grey frames that are decoded."""
     if every is not None:
         return FrameSelection(every)
     decoded: list[int] = []
 
-    def frames() -> Iterator[NDArray[np.uint8]]:
+    def frames() -> Iterator[UInt8Array]:
         for number, frame in enumerate(grey()):
             if frame is not None:
                 decoded.append(number)

@@ -44,7 +44,6 @@ def with_masks(sources: Sequence[Source], masks: str | Path | None, *, all_known
 
 
 def _by_stem(folder: Path) -> Mapping[str, Path]:
-    """The masks in a folder, by their names before the suffix."""
 
     def refuse(error: OSError) -> None:
         raise InputError(f"{folder}: cannot read the folder: {error.strerror}") from error

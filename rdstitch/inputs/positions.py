@@ -74,8 +74,7 @@ def metres_around_median(known: Sequence[GpsPosition | None]) -> FloatArray:
     metres = np.full((len(known), 2), np.nan)
     metres[places] = Crs.nearest(latitude[places], longitude[places]).project(latitude[places], longitude[places])
     metres[~np.isfinite(metres).all(axis=1)] = np.nan
-    around: FloatArray = metres - np.nanmedian(metres, axis=0)
-    return around
+    return np.asarray(metres - np.nanmedian(metres, axis=0))
 
 
 def with_positions(
@@ -152,7 +151,6 @@ def _listed_fields(line: str) -> list[str]:
 
 
 def _by_rows(rows: Sequence[Row | None], file: str, system: NamedSystem | None) -> list[GpsPosition | None]:
-    """Positions by rows."""
     places: list[GpsPosition | None] = []
     coordinates = [None if row is None else coordinates_of(row) for row in rows]
     degrees = iter(geographic_places([each for each in coordinates if each is not None], file, system))

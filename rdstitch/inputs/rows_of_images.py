@@ -8,7 +8,7 @@ called by their folders, the folders must agree too, as far as the row has any.
 from collections.abc import Iterable, Sequence
 from itertools import takewhile
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from rdstitch.errors import InputError
 from rdstitch.inputs.image_folders import place_of
@@ -26,17 +26,11 @@ class NamedFile(Protocol):
     def path(self) -> Path: ...
 
 
-class _Same(NamedTuple):
-    """Length of what two names have in common, in parts from the end; more is greater."""
-
-    folded: int  # in any case
-    exactly: int
-
-    @classmethod
-    def of(cls, place: Sequence[str], written: Sequence[str]) -> "_Same":
-        pairs = list(zip(reversed(place), reversed(written), strict=False))
-        alike = takewhile(lambda pair: pair[0].casefold() == pair[1].casefold(), pairs)
-        return cls(len(list(alike)), len(list(takewhile(lambda pair: pair[0] == pair[1], pairs))))
+def _in_common(place: Sequence[str], written: Sequence[str]) -> tuple[int, int]:
+    """Parts that two names have in common, from the end: in any case, and exactly."""
+    pairs = list(zip(reversed(place), reversed(written), strict=False))
+    alike = takewhile(lambda pair: pair[0].casefold() == pair[1].casefold(), pairs)
+    return len(list(alike)), len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
 
 
 class ImagesByName:
@@ -45,22 +39,18 @@ class ImagesByName:
     def __init__(self, images: Sequence[NamedFile]) -> None:
         self._images = images
         # By the file's name in small letters, then by place, at which one file may be several times.
-        self._alike: dict[str, dict[tuple[str, ...], list[int]]] = {}
+        self.by_file_name: dict[str, dict[tuple[str, ...], list[int]]] = {}
         for index, image in enumerate(images):
             *folders, _ = map(canonical_name, place_of(without_query(image.path)).parts)
             place = (*folders, image.name.rpartition("/")[2])
-            self._alike.setdefault(place[-1].casefold(), {}).setdefault(place, []).append(index)
+            self.by_file_name.setdefault(place[-1].casefold(), {}).setdefault(place, []).append(index)
 
-    def file_names(self) -> Iterable[str]:
-        """The names of their files, each once, in small letters."""
-        return self._alike
-
-    def find(self, name: str, where: str) -> tuple[list[int], _Same]:
+    def find(self, name: str, where: str) -> tuple[list[int], tuple[int, int]]:
         """Indices of the image of this name, none where there is none, and how much they have in common."""
-        written, best, same_names = name_parts(name), _Same(1, 0), list[list[int]]()
-        for place, indices in self._alike.get(written[-1].casefold(), {}).items() if written else ():
-            same, called = _Same.of(place, written), self._images[indices[0]].name.split("/")
-            if same >= best and same.folded >= min(len(called), len(written)):
+        written, best, same_names = name_parts(name), (1, 0), list[list[int]]()
+        for place, indices in self.by_file_name.get(written[-1].casefold(), {}).items() if written else ():
+            same, called = _in_common(place, written), self._images[indices[0]].name.split("/")
+            if same >= best and same[0] >= min(len(called), len(written)):
                 same_names = [*same_names, indices] if same == best else [indices]
                 best = same
         if len(same_names) > 1:
@@ -79,8 +69,8 @@ class RowsByImage:
 
     def of(self, images: Sequence[NamedFile]) -> list[Row | None]:
         """The row of each image, None where it has none."""
-        names, best = ImagesByName(images), dict[int, tuple[_Same, list[Row]]]()
-        for row in (row for name in names.file_names() for row in self._alike.get(name, ())):
+        names, best = ImagesByName(images), dict[int, tuple[tuple[int, int], list[Row]]]()
+        for row in (row for name in names.by_file_name for row in self._alike.get(name, ())):
             indices, same = names.find(row.values["name"], row.where)
             for index in indices:
                 before, rows = best.get(index, (same, []))

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import UInt8Array
 from rdstitch.errors import ArgumentError, InputError, LimitError, RdstitchError
 from rdstitch.features.prepared_image import View, halving
 from rdstitch.geometry.camera import Camera
@@ -79,10 +79,6 @@ class Source:
         x, y, z = rotation_from_tilt(self.attitude.tilt)[:, 2].tolist()
         return x, y, z
 
-    def number(self, position: int) -> int:
-        """Its number in the video or bag that it was taken from, else its position in the sequence."""
-        return position if self._frame.number is None else self._frame.number
-
     def with_absolute_paths(self) -> Self:
         """The source with absolute paths, for workers elsewhere, where relative ones begin at other folders."""
         mask = None if self.mask is None else replace(self.mask, path=self.mask.path.absolute())
@@ -129,7 +125,6 @@ class Source:
         return View(image.pixels, image.alpha, reduction, self.camera.image_size)
 
     def _load(self, reduction: int) -> DecodedImage:
-        """Read the pixels, corrected and masked."""
         if self._frame.image is None:
             with held_in_memory(self.path), self.guard.reading(self.path):
                 image = read_image(self.path, reduction, self.metadata)
@@ -158,7 +153,7 @@ class Source:
         return _masked(image, as_alpha(inside))
 
 
-def _masked(image: DecodedImage, alpha: NDArray[np.uint8]) -> DecodedImage:
+def _masked(image: DecodedImage, alpha: UInt8Array) -> DecodedImage:
     """The image where both its own alpha and another one have it."""
     return replace(image, alpha=alpha if image.alpha is None else np.minimum(image.alpha, alpha))
 
@@ -217,9 +212,7 @@ def _camera(metadata: Metadata, camera: Camera | None, focal: float | None, dist
         known = known.with_focal(focal, "option")
     elif known.focal_source in (None, "guess") and metadata.focal_px is not None:
         known = known.with_focal(metadata.focal_px, "exif")
-    if distortion is None:
-        return known
-    return known.with_coefficients(distortion)
+    return known if distortion is None else known.with_coefficients(distortion)
 
 
 def _fitted(camera: Camera, metadata: Metadata) -> Camera:

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,67 +39,49 @@ def with_times(frames: Sequence[Frame], file: str | Path | None) -> list[Frame]:
     """
     if file is None or not frames:
         return list(frames)
-    times = _read_times(file).of(frames)
+    known = _read_times(file)
+    times = _by_name(known, frames, file) if isinstance(known, RowsByImage) else _by_number(known, frames, file)
     return [replace(frame, timestamp=time) for frame, time in zip(frames, times, strict=True)]
 
 
 def time_of(frame: Frame, file: str | Path) -> float | None:
     """Time of one frame by a file that may grow as the frames do; None where it has none yet."""
-    try:
-        return _read_times(file).of_one(frame)
-    except InputError:
-        return None
+    with suppress(InputError):
+        known = _read_times(file)
+        if isinstance(known, RowsByImage):
+            return _by_name(known, [frame], file)[0]
+        if frame.number is not None and frame.number < len(known):
+            return known[frame.number]
+    return None
 
 
-@dataclass(frozen=True)
-class _TimesByNumber:
-    """Times in the order of the images, or of the frames of a video."""
-
-    file: str | Path
-    times: list[float]
-
-    def of(self, frames: Sequence[Frame]) -> list[float]:
-        """Times of all images, of which the file must have as many."""
-        numbers = np.array(frame_numbers(frames))
-        if len(np.unique(numbers)) < len(numbers):  # of several videos
-            numbers = np.arange(len(frames))
-        steps = np.unique(np.diff(np.sort(numbers)))
-        # Of every n-th frame of a video up to n - 1 may follow the last; of chosen ones, and of one, any number.
-        of_video = frames[0].number is not None and frames[0].image is None
-        most = numbers.max() + steps[0] if len(steps) == 1 else math.inf if len(steps) or of_video else 1
-        if not numbers.max() < len(self.times) <= most:
-            last = f" or frames, the last with the number {numbers.max()} from 0" if most != len(frames) else ""
-            counted = f"{len(self.times)} times for {len(frames)} images{last}"
-            raise InputError(f"{self.file}: has {counted}; give one for each, in order")
-        return [self.times[number] for number in numbers.tolist()]
-
-    def of_one(self, frame: Frame) -> float | None:
-        """Time of a frame by its number."""
-        return self.times[frame.number] if frame.number is not None and frame.number < len(self.times) else None
+def _by_name(rows: RowsByImage, frames: Sequence[Frame], file: str | Path) -> list[float]:
+    return [row.needed("timestamp") for row in rows.needed(frames, file, "time")]
 
 
-@dataclass(frozen=True)
-class _TimesByName:
-    """Times by the names of images."""
-
-    file: str | Path
-    rows: RowsByImage
-
-    def of(self, frames: Sequence[Frame]) -> list[float]:
-        """Times of images, each of which the file must name."""
-        return [row.needed("timestamp") for row in self.rows.needed(frames, self.file, "time")]
-
-    def of_one(self, frame: Frame) -> float | None:
-        """Time of a frame by its name."""
-        return self.of([frame])[0]
+def _by_number(times: Sequence[float], frames: Sequence[Frame], file: str | Path) -> list[float]:
+    """Times of all images, in their order or that of the frames of a video, of which there must be as many."""
+    numbers = np.array(frame_numbers(frames))
+    if len(np.unique(numbers)) < len(numbers):  # of several videos
+        numbers = np.arange(len(frames))
+    steps = np.unique(np.diff(np.sort(numbers)))
+    # Of every n-th frame of a video up to n - 1 may follow the last; of chosen ones, and of one, any number.
+    of_video = frames[0].number is not None and frames[0].image is None
+    most = numbers.max() + steps[0] if len(steps) == 1 else math.inf if len(steps) or of_video else 1
+    if not numbers.max() < len(times) <= most:
+        last = f" or frames, the last with the number {numbers.max()} from 0" if most != len(frames) else ""
+        counted = f"{len(times)} times for {len(frames)} images{last}"
+        raise InputError(f"{file}: has {counted}; give one for each, in order")
+    return [times[number] for number in numbers.tolist()]
 
 
 @cached_by_file_state
-def _read_times(file: str | Path) -> _TimesByNumber | _TimesByName:
+def _read_times(file: str | Path) -> list[float] | RowsByImage:
+    """Times in the order of the images, or by their names."""
     text = read_text(file)
     lines = numbered_lines(text, str(file))
     if lines and all(is_number(line) for _, line in lines):
-        return _TimesByNumber(file, [float(line) for _, line in lines])
+        return [float(line) for _, line in lines]
     if not lines or not is_number(lines[0][1].split()[0]):
         rows = csv_rows(text, str(file), _COLUMNS, ("name,timestamp",), {"timestamp": "s"})
     else:
@@ -109,4 +92,4 @@ def _read_times(file: str | Path) -> _TimesByNumber | _TimesByName:
                 wanted = f"a table with the columns {','.join(_COLUMNS)}, lines TIMESTAMP NAME, or one time a line"
                 raise InputError(f"{where}: found '{line}'; give {wanted}")
             rows.append(Row(where, {"name": name, "timestamp": time}, "."))
-    return _TimesByName(file, RowsByImage(rows))
+    return RowsByImage(rows)

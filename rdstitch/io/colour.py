@@ -2,13 +2,12 @@
 
 import io
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import AnyArray, FloatArray
 from rdstitch.io.samples import ROWS_AT_A_TIME
 
 if TYPE_CHECKING:
@@ -22,7 +21,7 @@ _XYZ_TO_RGB = np.array(
 _EDGE = 6.0 / 29.0  # where the cube root of CIE 1976 becomes a line
 
 
-def srgb_of_lab(lab: NDArray[Any], *, signed: bool) -> NDArray[Any]:
+def srgb_of_lab(lab: AnyArray, *, signed: bool) -> AnyArray:
     """Samples of CIELAB (h, w, 3), 8 or 16 bits as TIFF stores them, as sRGB of the same type.
 
     In TIFF's own CIELAB a* and b* are signed; else they are offset by half of their range, as profiles have them.
@@ -34,7 +33,7 @@ def srgb_of_lab(lab: NDArray[Any], *, signed: bool) -> NDArray[Any]:
     return rgb
 
 
-def _srgb_of_lab(lab: NDArray[Any], *, signed: bool) -> FloatArray:
+def _srgb_of_lab(lab: AnyArray, *, signed: bool) -> FloatArray:
     full = np.iinfo(lab.dtype).max
     unit = (full + 1) // 256
     chroma = lab[..., 1:].view(f"i{lab.dtype.itemsize}") if signed else lab[..., 1:].astype(np.int64) - 128 * unit
@@ -43,16 +42,15 @@ def _srgb_of_lab(lab: NDArray[Any], *, signed: bool) -> FloatArray:
     xyz = np.where(cube > _EDGE, cube**3, 3.0 * _EDGE**2 * (cube - 4.0 / 29.0)) * _WHITE
     linear = np.clip(xyz @ _XYZ_TO_RGB.T, 0.0, 1.0)
     gamma = np.where(linear > 0.0031308, 1.055 * linear ** (1.0 / 2.4) - 0.055, 12.92 * linear)
-    samples: FloatArray = np.rint(gamma * full)
-    return samples
+    return np.asarray(np.rint(gamma * full))
 
 
-def ink_transform(profile: bytes) -> "ImageCms.ImageCmsTransform | None":
-    """What a colour profile of inks (CMYK) makes of them in sRGB; None where it cannot be used."""
+def transform_to_srgb(profile: bytes, mode: str = "CMYK") -> "ImageCms.ImageCmsTransform | None":
+    """What a colour profile, of inks (CMYK) or others, makes of samples in sRGB; None where it cannot be used."""
     from PIL import ImageCms
 
     try:
-        return ImageCms.buildTransform(io.BytesIO(profile), ImageCms.createProfile("sRGB"), "CMYK", "RGB")
+        return ImageCms.buildTransform(io.BytesIO(profile), ImageCms.createProfile("sRGB"), mode, "RGB")
     except (ImageCms.PyCMSError, ImportError):
         return None
 
@@ -60,7 +58,7 @@ def ink_transform(profile: bytes) -> "ImageCms.ImageCmsTransform | None":
 def without_inks(image: Image.Image) -> Image.Image:
     """An image of inks in sRGB, by its colour profile where it has one; any other as it is."""
     profile = image.info.get("icc_profile")
-    transform = ink_transform(profile) if image.mode == "CMYK" and isinstance(profile, bytes) else None
+    transform = transform_to_srgb(profile) if image.mode == "CMYK" and isinstance(profile, bytes) else None
     if transform is None:
         return image
     from PIL import ImageCms
@@ -77,11 +75,9 @@ def colour_space(profile: bytes) -> bytes:
 @lru_cache(maxsize=16)
 def _is_linear(profile: bytes) -> bool:
     """Whether samples are proportional to light, as those of "linear sRGB" are: middle grey is 188 in sRGB then."""
+    if (to_srgb := transform_to_srgb(profile, "RGB")) is None:
+        return False
     from PIL import ImageCms
 
-    try:
-        to_srgb = ImageCms.buildTransform(io.BytesIO(profile), ImageCms.createProfile("sRGB"), "RGB", "RGB")
-    except (ImageCms.PyCMSError, ImportError):
-        return False
     grey = ImageCms.applyTransform(Image.new("RGB", (1, 1), (128, 128, 128)), to_srgb)
     return bool(np.asarray(grey).mean() > (128 + 188) / 2)

@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import UInt8Array
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.pyramid import pyramid, pyramid_sizes
 from rdstitch.io.read import read_image
@@ -53,23 +53,23 @@ def write_deep_zoom(description: Path, folder: Path, spec: ImageSpec, strips: It
     )
 
 
-def read_deep_zoom(path: Path, size: tuple[int, int], side: int) -> NDArray[np.uint8]:
+def read_deep_zoom(path: Path, size: tuple[int, int], side: int) -> UInt8Array:
     """Read the smallest level whose longer side has ``side`` pixels, or else the largest, of an image of ``size``."""
     sizes = pyramid_sizes(size, 1)[::-1]
     level = next((k for k, level_size in enumerate(sizes) if max(level_size) >= side), len(sizes) - 1)
     columns, rows = (range(-(-n // TILE)) for n in sizes[level])
     folder = tiles_folder(path) / str(level)
 
-    def tile(column: int, row: int) -> NDArray[np.uint8]:
-        pixels: NDArray[np.uint8] = read_image(folder / f"{column}_{row}.jpg").pixels
+    def tile(column: int, row: int) -> UInt8Array:
+        pixels: UInt8Array = read_image(folder / f"{column}_{row}.jpg").pixels
         return pixels[OVERLAP if row else 0 :][:TILE, OVERLAP if column else 0 :][:, :TILE]
 
     return np.concatenate([np.concatenate([tile(c, r) for c in columns], axis=1) for r in rows])
 
 
-def _tile_rows(strips: Iterable[NDArray[np.uint8]], height: int) -> Iterator[NDArray[np.uint8]]:
+def _tile_rows(strips: Iterable[UInt8Array], height: int) -> Iterator[UInt8Array]:
     """Each row of tiles of an image, with their overlap, from its strips."""
-    row, top, held = 0, 0, list[NDArray[np.uint8]]()
+    row, top, held = 0, 0, list[UInt8Array]()
     for strip in strips:
         rows = np.concatenate([*held, strip])
         while row * TILE < height and (span := _tile_span(row, height))[1] <= top + len(rows):

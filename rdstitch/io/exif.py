@@ -121,7 +121,7 @@ def upright_exif(exif: Image.Exif, width: int) -> bytes:
 
     The resolution of the focal plane counts pixels of the size that EXIF says; ``width`` is that of the image.
     """
-    if not len(exif):
+    if not (len(exif) or any(map(exif.get_ifd, (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)))):
         return b""
 
     def clean(kept: Image.Exif) -> None:

@@ -3,11 +3,10 @@
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, Float32Array
 from rdstitch.errors import InputError
 from rdstitch.io.opening import check_readable, decoding
 from rdstitch.io.read_tiff import image_pages
@@ -19,10 +18,10 @@ from rdstitch.system.late_imports import tifffile
 class FlatField:
     """Illumination of all images of a camera: ``measured = gain * light + dark``."""
 
-    gain: NDArray[np.float32]  # (h, w, C), float32: mean 1 in each channel
-    dark: NDArray[np.float32]  # (h, w, C) or (1, 1, C), float32: samples without light
+    gain: Float32Array  # (h, w, C), float32: mean 1 in each channel
+    dark: Float32Array  # (h, w, C) or (1, 1, C), float32: samples without light
 
-    def corrected(self, pixels: NDArray[Any], reduction: int = 1) -> NDArray[Any]:
+    def corrected(self, pixels: AnyArray, reduction: int = 1) -> AnyArray:
         """``(v - dark) / gain + dark`` of samples (h, w) or (h, w, C), reduced or not, in their type.
 
         The dark level stays, so that noise about it is not cut off at 0.
@@ -49,14 +48,14 @@ def read_flat_field(file: str | Path, size: tuple[int, int], channels: int) -> F
     check_readable(path)
     with decoding(path), tifffile.TiffFile(path) as tiff:
         pages = [np.asarray(page.asarray(), dtype=np.float32) for page in islice(image_pages(tiff), 2)]
-    for number, page in enumerate(pages, 1):
-        if page.shape[:2] != size[::-1]:
-            has = f"page {number} has {page.shape[1]} x {page.shape[0]} pixels"
-            raise InputError(f"{file}: {has}, but the tiles {size[0]} x {size[1]}")
     planes = [page.reshape(*page.shape[:2], -1) for page in pages]
     for number, plane in enumerate(planes, 1):
-        if plane.shape[2] not in (1, channels):
-            raise InputError(f"{file}: page {number} has {plane.shape[2]} channels, but the tiles {channels}")
+        height, width, bands = plane.shape
+        if (width, height) != size:
+            has = f"page {number} has {width} x {height} pixels"
+            raise InputError(f"{file}: {has}, but the tiles {size[0]} x {size[1]}")
+        if bands not in (1, channels):
+            raise InputError(f"{file}: page {number} has {bands} channels, but the tiles {channels}")
         if not np.isfinite(plane).all():
             raise InputError(f"{file}: page {number} has values that are not finite")
     gain = planes[0]

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from rdstitch.errors import LimitError, OutputError
-from rdstitch.io.ome_zarr import check_zarr
 from rdstitch.io.strips import ImageSpec
+from rdstitch.io.write_ome import check_zarr
 from rdstitch.system.output_checks import check_suffix
 
 

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, Float32Array, FloatArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.io.read import DecodedImage, Pixels
+from rdstitch.io.read import DecodedImage
 
 _NODES = 320  # along the width, at which the displacement is computed
 _MAX_STEP = 8  # pixels between nodes
@@ -37,16 +37,8 @@ def corrected(image: DecodedImage, camera: Camera, reduction: int) -> DecodedIma
     return replace(image, pixels=pixels, alpha=None if whole else opaque)
 
 
-def _places(camera: Camera, reduction: int, top: int, count: int, width: int) -> NDArray[np.float64]:
+def _places(camera: Camera, reduction: int, top: int, count: int, width: int) -> FloatArray:
     """Where the lens shows the pixels of ``count`` rows, pixels (R, W, 2) of the image; NaN where it does not."""
-    step, moved = _moved(camera, reduction, top, count, width)
-    whole = cv2.resize(moved, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
-    pixel = np.stack(np.meshgrid(np.arange(width), np.arange(top, top + count)), axis=-1)
-    return np.asarray(whole[step : step + count, step : step + width] + pixel)
-
-
-def _moved(camera: Camera, reduction: int, top: int, count: int, width: int) -> tuple[int, NDArray[np.float64]]:
-    """Pixels between nodes over ``count`` rows, and by how much the lens moves what is at each."""
     step = min(max(width // _NODES, 1), _MAX_STEP)
     # A step beyond each side: what is interpolated is never extrapolated.
     nodes = [np.arange(-1, -(-side // step) + 1) * step + (step - 1) / 2 for side in (width, count)]
@@ -55,10 +47,12 @@ def _moved(camera: Camera, reduction: int, top: int, count: int, width: int) -> 
     assert camera.lens_model is not None
     with np.errstate(all="ignore"):
         shown = (camera.lens_model.distort(camera.undistort(grid * reduction + offset)) - offset) / reduction
-    return step, shown - grid
+    whole = cv2.resize(shown - grid, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
+    pixel = np.stack(np.meshgrid(np.arange(width), np.arange(top, top + count)), axis=-1)
+    return np.asarray(whole[step : step + count, step : step + width] + pixel)
 
 
-def _resampled(pixels: Pixels, x: NDArray[np.float32], y: NDArray[np.float32]) -> Pixels:
+def _resampled(pixels: AnyArray, x: Float32Array, y: Float32Array) -> AnyArray:
     """Samples (H, W) or (H, W, C) at places (R, W)."""
     if pixels.ndim == 3 and pixels.shape[2] > _CHANNELS:
         bands = [_resampled(np.ascontiguousarray(pixels[..., k]), x, y) for k in range(pixels.shape[2])]

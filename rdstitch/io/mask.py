@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import UInt8Array
 from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import inverse, turned, turned_size
 from rdstitch.io.metadata import read_metadata
@@ -20,9 +20,24 @@ class Mask:
     path: Path
     frame: int | None = None  # how it is turned, see :func:`mask_frame`
 
-    def read(self, size: tuple[int, int]) -> NDArray[np.uint8]:
-        """Alpha of an image of a size."""
-        return read_mask(self.path, size, self.frame)
+    def read(self, size: tuple[int, int]) -> UInt8Array:
+        """Alpha (height, width) of an image of a size: 255 where it counts, 0 where it is excluded.
+
+        What is darker than half of the mask's brightest value is excluded, so that masks of 0 and 1, masks of 0 and
+        255, and lossily compressed ones all mean what they show. What is transparent in the mask is excluded, too.
+        """
+        mask = read_image(self.path)
+        light = mask.pixels if mask.pixels.ndim == 2 else mask.pixels.max(axis=2)
+        brightest = light.max()
+        counts = light >= (brightest / 2 if brightest > 0 else 1)
+        if mask.alpha is not None:
+            counts &= mask.alpha >= (OPAQUE + 1) // 2
+        if self.frame is not None:
+            counts = turned(turned(counts, inverse(mask.metadata.orientation)), self.frame)
+        height, width = counts.shape
+        rows = (np.arange(size[1]) + 0.5) * (height / size[1])
+        columns = (np.arange(size[0]) + 0.5) * (width / size[0])
+        return as_alpha(counts[np.ix_(rows.astype(np.intp), columns.astype(np.intp))])
 
 
 def mask_frame(
@@ -44,24 +59,3 @@ def mask_frame(
         f"{path}: a mask of {mask.size[0]} x {mask.size[1]} pixels does not fit on {image}, which has "
         f"{width} x {height} pixels; a mask has its image's size, or another size of the same shape"
     )
-
-
-def read_mask(path: str | Path, size: tuple[int, int], frame: int | None = None) -> NDArray[np.uint8]:
-    """Read a mask as alpha (height, width) for an image: 255 where the image counts, 0 where it is excluded.
-
-    What is darker than half of the mask's brightest value is excluded, so that masks of 0 and 1, masks of 0 and 255,
-    and lossily compressed ones all mean what they show. What is transparent in the mask is excluded, too.
-    """
-    mask = read_image(path)
-    light = mask.pixels if mask.pixels.ndim == 2 else mask.pixels.max(axis=2)
-    brightest = light.max()
-    counts = light >= (brightest / 2 if brightest > 0 else 1)
-    if mask.alpha is not None:
-        counts &= mask.alpha >= (OPAQUE + 1) // 2
-    if frame is not None:
-        counts = turned(turned(counts, inverse(mask.metadata.orientation)), frame)
-    height, width = counts.shape
-    rows = (np.arange(size[1]) + 0.5) * (height / size[1])
-    columns = (np.arange(size[0]) + 0.5) * (width / size[0])
-    resized = counts[np.ix_(rows.astype(np.intp), columns.astype(np.intp))]
-    return as_alpha(resized)

@@ -12,7 +12,7 @@ from PIL import ExifTags, Image
 from rdstitch.geometry.exif_orientation import turned_size, turning_matrix
 from rdstitch.geometry.places import GpsPosition
 from rdstitch.io.attitude import Attitude, finite, read_attitude, xmp_text
-from rdstitch.io.colour import ink_transform
+from rdstitch.io.colour import transform_to_srgb
 from rdstitch.io.exif import (
     author_and_time,
     exposure_of,
@@ -208,7 +208,7 @@ def _colour_profile(profile: object) -> tuple[bytes, str]:
     if len(profile) > MAX_PROFILE:
         return b"", f"its colour profile of {len(profile) / 1e6:.1f} MB is too large for PNG readers"
     if profile[_COLOUR_SPACE] == b"CMYK":
-        return b"", "" if ink_transform(profile) else "its colour profile of inks (CMYK) cannot be used"
+        return b"", "" if transform_to_srgb(profile) else "its colour profile of inks (CMYK) cannot be used"
     if profile[_COLOUR_SPACE] == b"Lab ":
         return b"", ""
     return profile, ""

@@ -10,11 +10,12 @@ import os
 import stat
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from pkgutil import resolve_name
+from typing import Any, BinaryIO
 
 import cv2
 from PIL import Image, ImageFile
@@ -23,8 +24,6 @@ from rdstitch.errors import InputError
 from rdstitch.system.file_access import is_url, open_regular, remote_status
 from rdstitch.system.late_imports import tifffile
 from rdstitch.system.machine import memory_size
-
-Factory = Callable[[IO[bytes], str], ImageFile.ImageFile]
 
 HEIF_SUFFIXES = frozenset((".heic", ".heif", ".hif"))
 RAW_SUFFIXES = frozenset(
@@ -191,31 +190,24 @@ def check_decoded_size(file: Path, size: tuple[int, int], channels: int, bits: i
         )
 
 
-def _factory(file: Path, stream: BinaryIO) -> Factory:
-    """What opens the format of a file, by its first bytes."""
+def _factory(file: Path, stream: BinaryIO) -> Any:
+    """What opens the format of a file, by its first bytes: makes an image of a stream and its name."""
     beginning = stream.read(_MAX_MAGIC)
     stream.seek(0)
     for magic, reader in _FORMATS.items():
         if beginning.startswith(magic):
-            return _imported(reader)
+            return resolve_name(reader)
     if beginning[4:8] == b"ftyp":
         if beginning[8:12] in (b"avif", b"avis"):
             try:
-                return _imported("PIL.AvifImagePlugin.AvifImageFile")
+                return resolve_name("PIL.AvifImagePlugin.AvifImageFile")
             except ImportError:
                 raise InputError(f"{file}: AVIF needs Pillow 11.3 or newer; or convert it to JPEG or TIFF") from None
         # No opener is registered with Pillow, since that would be for the whole process.
-        heif: Factory = reader_package("pillow_heif", file).HeifImageFile
-        return heif
+        return reader_package("pillow_heif", file).HeifImageFile
     if file.suffix.lower() == ".tga":  # has no magic
-        return _imported("PIL.TgaImagePlugin.TgaImageFile")
+        return resolve_name("PIL.TgaImagePlugin.TgaImageFile")
     raise InputError(f"{file}: not an image in a supported format: {_NAMES}")
-
-
-def _imported(name: str) -> Factory:
-    module, _, attribute = name.rpartition(".")
-    factory: Factory = getattr(import_module(module), attribute)
-    return factory
 
 
 def is_raw(path: Path) -> bool:

@@ -2,12 +2,12 @@
 
 import io
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, JpegImagePlugin
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.io.deepzoom import read_deep_zoom
 from rdstitch.io.read import read_image
 from rdstitch.system.late_imports import tifffile
@@ -16,7 +16,7 @@ _JPEG_QUALITY = 80
 _OVERVIEW_FROM = 60_000_000  # pixels; of larger TIFF files the smallest overview that is large enough is read
 
 
-def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[NDArray[Any], NDArray[np.uint8] | None]:
+def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[AnyArray, UInt8Array | None]:
     """Samples and alpha of an image that rdstitch wrote, at least ``side`` pixels long where it is that large."""
     suffix = path.suffix.lower()
     if suffix == ".dzi":
@@ -38,7 +38,7 @@ def read_preview(path: Path, size: tuple[int, int], side: int) -> tuple[NDArray[
 
 
 def encode_preview(
-    pixels: NDArray[Any], side: int, alpha: NDArray[np.uint8] | None = None, kind: Literal["JPEG", "PNG"] = "JPEG"
+    pixels: AnyArray, side: int, alpha: UInt8Array | None = None, kind: Literal["JPEG", "PNG"] = "JPEG"
 ) -> bytes:
     """An image of any sample type as a small file, its longer side at most ``side`` pixels."""
     # Far too large images are thinned out before they are smoothed.
@@ -52,7 +52,7 @@ def encode_preview(
     return stream.getvalue()
 
 
-def _as_bytes(pixels: NDArray[Any]) -> NDArray[np.uint8]:
+def _as_bytes(pixels: AnyArray) -> UInt8Array:
     """Grey or RGB in 8 bits; deeper samples are stretched between their extremes."""
     shown = pixels if pixels.ndim == 2 else pixels[..., :3]
     if shown.ndim == 3 and shown.shape[2] < 3:

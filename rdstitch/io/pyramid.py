@@ -4,11 +4,11 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray
 from rdstitch.io.reduction import halved, reduced_size
 from rdstitch.io.strips import STRIP_ROWS
 
@@ -24,8 +24,8 @@ def pyramid_sizes(size: tuple[int, int], smallest: int) -> list[tuple[int, int]]
 
 
 def pyramid(
-    sizes: list[tuple[int, int]], strips: Iterable[NDArray[Any]], folder: Path, *, transparent: bool
-) -> Iterator[tuple[tuple[int, int], Iterator[NDArray[Any]]]]:
+    sizes: list[tuple[int, int]], strips: Iterable[AnyArray], folder: Path, *, transparent: bool
+) -> Iterator[tuple[tuple[int, int], Iterator[AnyArray]]]:
     """Each size of an image with strips (h, w, C) of it, which are taken one size after the other, to their ends.
 
     The smaller image is made while strips pass, and waits in a temporary file in a folder until its turn; memory is
@@ -34,15 +34,15 @@ def pyramid(
     with ExitStack() as stack:
         for size, smaller in zip(sizes, [*sizes[1:], None], strict=True):
             spill = None if smaller is None else stack.enter_context(tempfile.TemporaryFile(dir=folder))
-            kind: list[NDArray[Any]] = []
+            kind: list[AnyArray] = []
             yield size, _spilling(strips, spill, kind, transparent)
             if spill is not None and smaller is not None:
                 strips = _reread(spill, smaller, kind[0])
 
 
 def _spilling(
-    strips: Iterable[NDArray[Any]], spill: IO[bytes] | None, kind: list[NDArray[Any]], transparent: bool
-) -> Iterator[NDArray[Any]]:
+    strips: Iterable[AnyArray], spill: IO[bytes] | None, kind: list[AnyArray], transparent: bool
+) -> Iterator[AnyArray]:
     """The strips; what passes is also written, half as large, to a file, and a pixel of it kept in ``kind``."""
     for strip in strips:
         # Before it is passed on: a writer does not come back after the last tile.
@@ -53,7 +53,7 @@ def _spilling(
         yield strip
 
 
-def _reread(spill: IO[bytes], size: tuple[int, int], kind: NDArray[Any]) -> Iterator[NDArray[Any]]:
+def _reread(spill: IO[bytes], size: tuple[int, int], kind: AnyArray) -> Iterator[AnyArray]:
     """Strips from a file of plain samples, which is closed afterwards."""
     width, height = size
     spill.seek(0)

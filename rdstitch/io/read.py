@@ -4,13 +4,12 @@ import math
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import simplejpeg
-from numpy.typing import NDArray
 from PIL import Image
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turned
 from rdstitch.io.colour import without_inks
@@ -29,8 +28,6 @@ _END_OF_IMAGE = b"\xff\xd9"
 _PADDING = re.compile(r"(\d+) extraneous bytes before marker 0xd9")
 _MIN_SIDE = 8  # pixels of a JPEG image; below, different reductions give images of the same size
 
-Pixels = NDArray[Any]
-
 
 @dataclass(frozen=True, eq=False)
 class DecodedImage:
@@ -38,9 +35,9 @@ class DecodedImage:
 
     # (height, width) or (height, width, channels): uint8, uint16 or float32. Colour is in RGB order, never BGR. The
     # EXIF orientation has been applied
-    pixels: Pixels
+    pixels: AnyArray
     # (height, width), uint8: 255 where the image is opaque, 0 where it says nothing; None when it is opaque everywhere
-    alpha: NDArray[np.uint8] | None
+    alpha: UInt8Array | None
     metadata: Metadata
     # why some of the pixels may be wrong: the complaint of a decoder that went on nevertheless. Empty without one
     damage: str = ""
@@ -95,7 +92,7 @@ def reduced(image: DecodedImage, factor: int) -> DecodedImage:
     return replace(image, pixels=block_mean(image.pixels, factor), alpha=alpha)
 
 
-def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) -> tuple[Pixels | None, str]:
+def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) -> tuple[AnyArray | None, str]:
     """Samples of 1/``factor`` of the size, (h, w) or (h, w, 3) in RGB order as stored, and what is wrong with the file.
 
     What Pillow would decode, bit for bit, in less time and memory. Pillow has the last word on files about which
@@ -113,7 +110,7 @@ def decoded_jpeg(file: Path, size: tuple[int, int], factor: int, *, grey: bool) 
         )
     except ValueError as error:
         return None, "" if _is_padding(str(error), data) else str(error)
-    whole: Pixels = np.asarray(samples)[..., 0] if grey else np.asarray(samples)
+    whole: AnyArray = np.asarray(samples)[..., 0] if grey else np.asarray(samples)
     return (whole if whole.shape[:2] == (height, width) else None), ""
 
 
@@ -137,7 +134,7 @@ def _decoder_reduction(image: Image.Image, metadata: Metadata, reduction: int) -
     return 1 if image.format not in _JPEG or min(image.size) < factor or crosswise else factor
 
 
-def from_pillow(image: Image.Image, factor: int = 1) -> tuple[Pixels, Pixels | None]:
+def from_pillow(image: Image.Image, factor: int = 1) -> tuple[AnyArray, AnyArray | None]:
     """Samples and alpha of any mode of Pillow's, by such a share of the decoder smaller."""
     if factor > 1:
         wanted = reduced_size(image.size, factor)
@@ -158,7 +155,7 @@ def from_pillow(image: Image.Image, factor: int = 1) -> tuple[Pixels, Pixels | N
     return (samples[..., 0] if grey else samples[..., :3]), samples[..., 3]
 
 
-def _samples(image: Image.Image) -> Pixels:
+def _samples(image: Image.Image) -> AnyArray:
     """The samples of an image, taken in pieces: Pillow's own conversion holds them three times."""
     image.load()
     width, height = image.size
@@ -170,14 +167,14 @@ def _samples(image: Image.Image) -> Pixels:
     return samples
 
 
-def _split(samples: Pixels) -> tuple[Pixels, Pixels | None]:
+def _split(samples: AnyArray) -> tuple[AnyArray, AnyArray | None]:
     """Grey or colours, and alpha, of an array (h, w, 2) or (h, w, 4); any other as it is."""
     if samples.ndim == 2 or samples.shape[2] == 3:
         return samples, None
     return (samples[..., 0] if samples.shape[2] == 2 else samples[..., :3]), samples[..., -1]
 
 
-def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
+def _read_tiff(file: Path) -> tuple[AnyArray, AnyArray | None]:
     """Samples and alpha of the first page, or of the channels of a microscope."""
     with open_regular(file) as stream, tifffile.TiffFile(stream, name=str(file)) as tiff:
         pages = first_image_pages(tiff)
@@ -186,7 +183,7 @@ def _read_tiff(file: Path) -> tuple[Pixels, Pixels | None]:
         return np.stack([page.asarray() for page in pages], axis=-1), None
 
 
-def as_image(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metadata) -> DecodedImage:
+def as_image(file: Path, samples: AnyArray, alpha: AnyArray | None, metadata: Metadata) -> DecodedImage:
     """An image from samples as stored: upright, in one of the three sample types, contiguous, and without NaN."""
     if samples.size == 0:
         raise InputError(f"{file}: has no pixels")
@@ -199,10 +196,8 @@ def as_image(file: Path, samples: Pixels, alpha: Pixels | None, metadata: Metada
         valid = finite if samples.ndim == 2 else finite.all(axis=2)
         if not valid.all():
             samples = np.where(finite, samples, np.float32(0.0))
-            whole = np.full(valid.shape, OPAQUE, np.uint8) if opaque is None else opaque
-            opaque = np.where(valid, whole, np.uint8(0))
-    if opaque is not None and bool((opaque == OPAQUE).all()):
-        opaque = None
+            opaque = np.where(valid, np.uint8(OPAQUE) if opaque is None else opaque, np.uint8(0))
     if opaque is not None:
-        opaque = np.ascontiguousarray(turned(opaque, metadata.orientation))
+        whole = bool((opaque == OPAQUE).all())
+        opaque = None if whole else np.ascontiguousarray(turned(opaque, metadata.orientation))
     return DecodedImage(np.ascontiguousarray(turned(samples, metadata.orientation)), opaque, metadata)

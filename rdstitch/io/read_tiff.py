@@ -7,18 +7,15 @@ something.
 
 from collections.abc import Iterator
 from itertools import islice
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+from rdstitch.arrays import AnyArray, BoolArray, UInt8Array
 from rdstitch.io.colour import srgb_of_lab, without_inks
 from rdstitch.io.ome import OmeImage, read_ome
 from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME, as_alpha
 from rdstitch.system.late_imports import tifffile
-
-Pixels = NDArray[Any]
 
 _MASK, _MASK_WITHIN = 4, 40  # the kind of a page that masks the image, and how many pages are looked at for one
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _PALETTE, _STENCIL, _INKS, _YCBCR = range(7)
@@ -39,8 +36,7 @@ def image_pages(tiff: "tifffile.TiffFile") -> Iterator["tifffile.TiffPage"]:
     """The pages of a file that are images of their own; the first page always is."""
     yield tiff.pages.first
     for number in range(1, len(tiff.pages)):  # which goes through the whole file
-        page = tiff.pages[number]
-        page = page if isinstance(page, tifffile.TiffPage) else page.aspage()
+        page = tiff.pages[number].aspage()
         if not (page.is_reduced or page.is_mask):
             yield page
 
@@ -62,7 +58,7 @@ def channel_count(page: "tifffile.TiffPage") -> int:
     return 3 if page.photometric == _INKS else int(page.samplesperpixel)
 
 
-def read_page(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> tuple[Pixels, NDArray[np.uint8] | None]:
+def read_page(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> tuple[AnyArray, UInt8Array | None]:
     """Samples (h, w) or (h, w, bands) of a page as stored, colours as grey or RGB, and its alpha."""
     kind, bits = int(page.photometric), page.bitspersample
     if kind not in _COLOURS or page.dtype is None or page.dtype.kind not in "buif":
@@ -97,7 +93,7 @@ def read_page(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> tuple[Pix
     return samples[..., 0] if samples.shape[2] == 1 else samples, np.minimum.reduce(given) if given else None
 
 
-def _grey_or_rgb(page: "tifffile.TiffPage", kind: int, colours: Pixels, full: float) -> Pixels:
+def _grey_or_rgb(page: "tifffile.TiffPage", kind: int, colours: AnyArray, full: float) -> AnyArray:
     """Grey or RGB (h, w, 1 or 3) of the bands that are colour, in the type they are stored in."""
     integers = colours.dtype in (np.uint8, np.uint16)
     if kind == _WHITE_IS_ZERO:
@@ -116,7 +112,7 @@ def _grey_or_rgb(page: "tifffile.TiffPage", kind: int, colours: Pixels, full: fl
     return colours
 
 
-def _by_pillow(page: "tifffile.TiffPage", colours: Pixels, mode: str) -> Pixels:
+def _by_pillow(page: "tifffile.TiffPage", colours: AnyArray, mode: str) -> AnyArray:
     """8-bit RGB of inks, by their colour profile where there is one, or of YCbCr."""
     if colours.dtype == np.uint16:
         colours = (colours >> 8).astype(np.uint8)
@@ -127,7 +123,7 @@ def _by_pillow(page: "tifffile.TiffPage", colours: Pixels, mode: str) -> Pixels:
     return np.asarray(without_inks(image).convert("RGB"))
 
 
-def _straight(colours: Pixels, alpha: Pixels, full: float) -> Pixels:
+def _straight(colours: AnyArray, alpha: AnyArray, full: float) -> AnyArray:
     """Colours that were multiplied by alpha without it; black where it is 0."""
     straight = np.empty_like(colours)
     for top in range(0, len(colours), ROWS_AT_A_TIME):
@@ -138,7 +134,7 @@ def _straight(colours: Pixels, alpha: Pixels, full: float) -> Pixels:
     return straight
 
 
-def _mask(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> NDArray[np.uint8] | None:
+def _mask(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> UInt8Array | None:
     """The alpha of the page's internal mask, a page of the same size beside it."""
     pages = (other for other in tiff.pages[1:_MASK_WITHIN] if isinstance(other, tifffile.TiffPage))
     for other in pages:
@@ -149,7 +145,7 @@ def _mask(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage") -> NDArray[np.ui
     return None
 
 
-def _lacks_data(page: "tifffile.TiffPage", *bands: Pixels) -> NDArray[np.bool_] | None:
+def _lacks_data(page: "tifffile.TiffPage", *bands: AnyArray) -> BoolArray | None:
     """Where a page has GDAL's NODATA; of counts, where all bands have it, since in one it may be part of a colour."""
     tag, kind = page.tags.get(_NODATA), bands[0].dtype.kind
     try:
@@ -161,7 +157,7 @@ def _lacks_data(page: "tifffile.TiffPage", *bands: Pixels) -> NDArray[np.bool_] 
     return np.asarray(equal.all(axis=2) if kind in "bu" else equal.any(axis=2))
 
 
-def as_opacity(alpha: Pixels, full: float) -> NDArray[np.uint8]:
+def as_opacity(alpha: AnyArray, full: float) -> UInt8Array:
     """Alpha of any sample type, which is ``full`` where the image is opaque, as 0..255."""
     if alpha.dtype == np.uint8 and full == OPAQUE:
         return np.asarray(alpha, dtype=np.uint8)

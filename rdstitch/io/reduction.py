@@ -1,10 +1,9 @@
 """Images made smaller by a whole factor: a pixel of the small one stands for a whole block of the large one."""
 
-from typing import Any
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+
+from rdstitch.arrays import AnyArray, Float32Array, UInt8Array
 
 
 def fitting_reduction(shrink: float) -> int:
@@ -17,7 +16,7 @@ def reduced_size(size: tuple[int, int], factor: int) -> tuple[int, int]:
     return -(-size[0] // factor), -(-size[1] // factor)
 
 
-def block_mean(samples: NDArray[Any], factor: int) -> NDArray[Any]:
+def block_mean(samples: AnyArray, factor: int) -> AnyArray:
     """Mean over blocks of ``factor`` x ``factor`` pixels of samples (h, w) or (h, w, C); borders repeat themselves."""
     if factor == 1:
         return samples
@@ -29,7 +28,7 @@ def block_mean(samples: NDArray[Any], factor: int) -> NDArray[Any]:
     return np.asarray(done).reshape(rows, columns, *samples.shape[2:])
 
 
-def mean_of_channels(samples: NDArray[np.float32]) -> NDArray[np.float32]:
+def mean_of_channels(samples: Float32Array) -> Float32Array:
     """Mean over the channels, up to 128, of samples (h, w) or (h, w, C); faster than NumPy, for three fifty times."""
     if samples.ndim == 2:
         return samples
@@ -37,7 +36,7 @@ def mean_of_channels(samples: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.transform(samples, np.full((1, channels), 1.0 / channels)), dtype=np.float32)
 
 
-def block_minimum(alpha: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+def block_minimum(alpha: UInt8Array, factor: int) -> UInt8Array:
     """Least value in blocks of ``factor`` x ``factor`` pixels of a plane (h, w): opaque where all of a block is."""
     if factor == 1:
         return alpha
@@ -47,7 +46,7 @@ def block_minimum(alpha: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
     return np.asarray(whole.reshape(rows, factor, columns, factor).min(axis=(1, 3)))
 
 
-def halved(strip: NDArray[Any], transparent: bool) -> NDArray[Any]:
+def halved(strip: AnyArray, transparent: bool) -> AnyArray:
     """Mean of 2 x 2 pixels (h, w, C), weighted by the alpha that the last channel is where it is transparent.
 
     An odd border repeats itself. Halves are rounded up, in every strip alike.
@@ -67,11 +66,11 @@ def halved(strip: NDArray[Any], transparent: bool) -> NDArray[Any]:
     return mean
 
 
-def _weighted_mean(corners: NDArray[Any], transparent: bool) -> NDArray[Any]:
+def _weighted_mean(corners: AnyArray, transparent: bool) -> AnyArray:
     """Mean over the first axis of samples (4, ..., C), weighted by the last channel where that is alpha."""
     integer = corners.dtype.kind == "u"
     values = corners.astype(np.float32)
-    mean: NDArray[Any] = values.mean(axis=0)
+    mean: AnyArray = values.mean(axis=0)
     if transparent:
         opacity = values[..., -1:] / np.float32(np.iinfo(corners.dtype).max if integer else 1.0)
         mean[..., :-1] = (values[..., :-1] * opacity).sum(axis=0) / np.maximum(opacity.sum(axis=0), np.float32(1e-6))

@@ -7,7 +7,7 @@ its folders of single images beside a ``metadata.txt``, and TIFF files of severa
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -15,8 +15,8 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.choices import ZPlane
 from rdstitch.errors import InputError
 from rdstitch.io.ome import MICROMETRES, Page, ome_pixel_size, ome_planes, ome_tree
@@ -52,7 +52,7 @@ class StoredTile:
         """Whether it is what any reader makes of its file."""
         return list(self.planes.values()) == [Page(self.name, 0)]
 
-    def read(self, z: ZPlane, time: int) -> tuple[NDArray[Any], NDArray[np.uint8] | None]:
+    def read(self, z: ZPlane, time: int) -> tuple[AnyArray, UInt8Array | None]:
         """Samples (h, w), or (h, w, C) of several channels, and alpha, of a z plane or the brightest of all."""
         channels, depth, _ = self.counts
         wanted = range(depth) if z == "max" else [z]
@@ -83,8 +83,7 @@ class StoredTile:
         """Width and height, bits and samples of a pixel, by the header of the first page."""
         page = self.planes[min(self.planes)]
         with decoding(page.file), open_regular(page.file) as stream, _tiff(stream, page.file) as tiff:
-            first = tiff.pages[page.number if page.number < len(tiff.pages) else 0]
-            assert isinstance(first, tifffile.TiffPage)
+            first = tiff.pages[page.number if page.number < len(tiff.pages) else 0].aspage()
             return (first.imagewidth, first.imagelength), int(first.bitspersample), int(first.samplesperpixel)
 
 
@@ -92,10 +91,9 @@ def _tiff(stream: Any, file: Path) -> "tifffile.TiffFile":
     return tifffile.TiffFile(stream, name=str(file))
 
 
-def _samples(tiff: "tifffile.TiffFile", number: int) -> tuple[NDArray[Any], NDArray[np.uint8] | None]:
+def _samples(tiff: "tifffile.TiffFile", number: int) -> tuple[AnyArray, UInt8Array | None]:
     if number < len(tiff.pages):
-        page = tiff.pages[number]
-        return read_page(tiff, page if isinstance(page, tifffile.TiffPage) else page.aspage())
+        return read_page(tiff, tiff.pages[number].aspage())
     # ImageJ writes large stacks behind one directory.
     stack = tiff.series[0].asarray()
     return np.asarray(stack.reshape(-1, *stack.shape[-2:])[number]), None
@@ -128,15 +126,12 @@ def _of_file(file: Path) -> list[StoredTile]:
             return [plain]
         stream.seek(0)
         with _tiff(stream, file) as tiff:
-            tiles = _ome(file, tiff) if tiff.is_ome else []
-            if tiles:
+            if tiff.is_ome and (tiles := _ome(file, tiff)):
                 return tiles
-            tags = [_micro_manager_tag(page) for page in tiff.pages[:1]]
-            if tags[0] is not None and len(tiff.pages) > 1:
-                tags = [_micro_manager_tag(page) for page in tiff.pages]
-            if tags[0] is not None:
-                return [_micro_manager(file, [(Page(file, k), tag) for k, tag in enumerate(tags) if tag])]
-            return [_stack(plain, tiff)]
+            if _micro_manager_tag(tiff.pages.first) is None:
+                return [_stack(plain, tiff)]
+            tags = enumerate(map(_micro_manager_tag, tiff.pages))
+            return [_micro_manager(file, [(Page(file, k), tag) for k, tag in tags if tag])]
 
 
 def _stack(plain: StoredTile, tiff: "tifffile.TiffFile") -> StoredTile:
@@ -180,14 +175,11 @@ def _ome(file: Path, tiff: "tifffile.TiffFile") -> list[StoredTile]:
     known = {element.get("FileName"): (element.text or "").strip() for element in root.iter("UUID")}
     by_name = file.name in known
     tiles = []
-    images = root.findall("Image")
-    for image in images:
-        pixels = image.find("Pixels")
-        if pixels is None:
-            continue
-        planes = ome_planes(file, len(tiff.pages), pixels, None if by_name else uuid)
-        if any(page.file == file for page in planes.values()):
-            tiles.append(_ome_tile(file, image, pixels, planes))
+    for image in root.findall("Image"):
+        if (pixels := image.find("Pixels")) is not None:
+            planes = ome_planes(file, len(tiff.pages), pixels, None if by_name else uuid)
+            if any(page.file == file for page in planes.values()):
+                tiles.append(_ome_tile(file, image, pixels, planes))
     shared = len(tiles) > 1
     return [replace(tile, name=Path(f"{file}#{k}")) if shared else tile for k, tile in enumerate(tiles)]
 
@@ -223,13 +215,10 @@ def _ome_tile(
 
 def _micro_manager_tag(page: Any) -> dict[str, Any] | None:
     """What Micro-Manager wrote of a page."""
-    tag = (page if isinstance(page, tifffile.TiffPage) else page.aspage()).tags.get("MicroManagerMetadata")
+    tag = page.aspage().tags.get("MicroManagerMetadata")
     value = None if tag is None else tag.value
-    if isinstance(value, str | bytes):
-        try:
-            value = json.loads(value)
-        except ValueError:
-            return None
+    with suppress(ValueError):
+        value = json.loads(value) if isinstance(value, str | bytes) else value
     return value if isinstance(value, dict) else None
 
 
@@ -246,11 +235,9 @@ def _micro_manager(name: Path, entries: Sequence[tuple[Page, Mapping[str, Any]]]
         channels[channel] = str(entry.get("Channel", ""))
     about = entries[0][1]
     position, pixel_size = None, None
-    try:
+    with suppress(TypeError, ValueError, LookupError):
         position = float(about["XPositionUm"]), float(about["YPositionUm"])
         pixel_size = float(about.get("PixelSizeUm") or 0.0) or None
-    except (TypeError, ValueError, LookupError):
-        pass
     names = tuple(channels.get(k, "") for k in range(max(channels) + 1))
     return StoredTile(name, planes, position, 1.0, pixel_size, names if all(names) else ())
 

@@ -6,13 +6,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.errors import ArgumentError
 from rdstitch.io.metadata import Metadata
 
 # Samples (h, W, C) and alpha (h, W), uint8, or None for opaque.
-Strip = tuple[NDArray[Any], NDArray[np.uint8] | None]
+Strip = tuple[AnyArray, UInt8Array | None]
 
 # Strips but the last have a multiple of this many rows: what JPEG (128) and TIFF tiles (256) need.
 STRIP_ROWS = 256
@@ -61,13 +61,13 @@ def check_strips(spec: ImageSpec, strips: Iterable[Strip]) -> Iterator[Strip]:
         raise ArgumentError(f"{rows} of {height} rows were given")
 
 
-def zero_uncovered(strips: Iterable[Strip]) -> Iterator[NDArray[Any]]:
+def zero_uncovered(strips: Iterable[Strip]) -> Iterator[AnyArray]:
     """The samples of strips, 0 where nothing covers them."""
     for samples, alpha in strips:
         yield samples if alpha is None else np.where(alpha[..., None] > 0, samples, 0)
 
 
-def placed_rows(parts: Iterable[NDArray[Any]]) -> Iterator[tuple[slice, NDArray[Any]]]:
+def placed_rows(parts: Iterable[AnyArray]) -> Iterator[tuple[slice, AnyArray]]:
     """Parts of an image from top to bottom, and which rows of it they are."""
     top = 0
     for rows in parts:
@@ -75,14 +75,14 @@ def placed_rows(parts: Iterable[NDArray[Any]]) -> Iterator[tuple[slice, NDArray[
         top += len(rows)
 
 
-def as_eight_bit(samples: NDArray[Any]) -> NDArray[np.uint8]:
+def as_eight_bit(samples: AnyArray) -> UInt8Array:
     """16 bits rounded to 8."""
     if samples.dtype == np.uint8:
         return np.asarray(samples, dtype=np.uint8)
     return ((samples.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
-def with_alpha(samples: NDArray[Any], alpha: NDArray[np.uint8] | None) -> NDArray[Any]:
+def with_alpha(samples: AnyArray, alpha: UInt8Array | None) -> AnyArray:
     """Samples (h, W, C) with alpha as one channel more, in the samples' type."""
     full = np.iinfo(samples.dtype).max if samples.dtype.kind == "u" else 1.0
     if alpha is None:

@@ -7,27 +7,25 @@ program reads the first page. Where there are overviews, the file is in the orde
 """
 
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from html import escape
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
+from rdstitch.arrays import AnyArray
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.pyramid import pyramid, pyramid_sizes
 from rdstitch.io.samples import as_alpha
 from rdstitch.io.strips import ImageSpec, Strip, with_alpha
 from rdstitch.io.tiff_order import put_in_order
 from rdstitch.results.messages import Message
-from rdstitch.system.ahead import in_order_ahead
 from rdstitch.system.late_imports import imagecodecs, tifffile
 
 TILE = 256  # side, pixels
-_AHEAD = 4  # tiles of each thread that are encoded before they are written
-_BUFFER = 2**24  # bytes of tiles that tifffile holds before it writes them; 256 MB by default
+_BUFFER = 2**24  # bytes of tiles that tifffile holds at a time; 256 MB by default
 _DEFLATE_LEVEL = 1  # of 1 to 12: 2 takes 1.7 times as long and makes files 2 % smaller
 MIN_OVERVIEW = 256  # pixels along the longer side: smaller images need no overview
 _REDUCED, _MASK = 1, 4  # kinds of pages (NewSubfileType)
@@ -46,19 +44,30 @@ def write_tiff(
     sizes = pyramid_sizes(spec.size, MIN_OVERVIEW)
     total = sum(w * h for w, h in sizes) * spec.samples_per_pixel * spec.dtype.itemsize
     joined = (with_alpha(*strip) if spec.transparent else strip[0] for strip in strips)
-    mask: list[bytes] | None = [] if _has_mask(spec) else None
-    with (
-        tifffile.TiffWriter(path, bigtiff=total > _BIGTIFF_FROM) as tiff,
-        ThreadPoolExecutor(workers) as pool,
-    ):
+    mask: list[bytes] | None = [] if spec.transparent and spec.channels == 1 else None
+    with tifffile.TiffWriter(path, bigtiff=total > _BIGTIFF_FROM) as tiff:
         for size, passing in pyramid(sizes, joined, path.parent, transparent=spec.transparent):
             kind = 0 if size == spec.size else _REDUCED
             tags = [] if kind else [*copied_tags(spec.metadata), *_band_names(spec), *extra_tags]
             shown = passing if mask is None else _without_alpha(passing, mask)
-            encoded = _encoded(tiles_of(shown), pool, workers)
-            _write_page(tiff, spec, size, encoded, tags, kind)
+            tiff.write(
+                tiles_of(shown),
+                **_samples(spec, size, alpha=spec.transparent and mask is None),
+                **tiled(spec.dtype),
+                buffersize=_BUFFER,
+                maxworkers=workers,
+                metadata=None,
+                subfiletype=kind,
+                resolution=None if kind else spec.metadata.resolution,
+                resolutionunit=None if kind or spec.metadata.resolution is None else "inch",
+                iccprofile=None if kind else spec.metadata.icc_profile or None,
+                extratags=tags,
+            )
             if mask is not None:
-                _write_mask(tiff, size, mask, kind | _MASK)
+                how = tiled(np.dtype(np.bool_))
+                tiff.write(
+                    iter(mask), shape=size[::-1], photometric="mask", **how, metadata=None, subfiletype=kind | _MASK
+                )
                 mask.clear()
     return put_in_order(path) if len(sizes) > 1 else []
 
@@ -71,13 +80,13 @@ def written_strips(path: Path) -> Iterator[Strip]:
         mask = next((each for each in (other.aspage() for other in others) if each.subfiletype == _MASK), None)
         width, height = page.imagewidth, page.imagelength
         across, last_is_alpha = -(-width // TILE), any(page.extrasamples[-1:])
+        streams = [
+            (tile for tile, _, _ in each.segments(maxworkers=1, buffersize=_BUFFER))
+            for each in (page, mask)
+            if each is not None
+        ]
         for top in range(0, height, TILE):
-            first = top // TILE * across
-            rows = [
-                np.concatenate([_tile(tiff, each, first + k) for k in range(across)], axis=1)[: height - top, :width]
-                for each in (page, mask)
-                if each is not None
-            ]
+            rows = [np.concatenate([*islice(tiles, across)], axis=2)[0, : height - top, :width] for tiles in streams]
             if mask is not None:
                 yield rows[0], as_alpha(rows[1][..., 0] > 0)
             elif last_is_alpha:
@@ -87,77 +96,32 @@ def written_strips(path: Path) -> Iterator[Strip]:
                 yield rows[0], None
 
 
-def _tile(tiff: "tifffile.TiffFile", page: "tifffile.TiffPage", index: int) -> NDArray[Any]:
-    """A tile (h, w, C), completed."""
-    tiff.filehandle.seek(page.dataoffsets[index])
-    samples, _, _ = page.decode(tiff.filehandle.read(page.databytecounts[index]), index)
-    assert samples is not None
-    tile = samples[0]
-    return np.pad(tile, [(0, TILE - tile.shape[0]), (0, TILE - tile.shape[1]), (0, 0)])
+def _samples(spec: ImageSpec, size: tuple[int, int], *, alpha: bool) -> dict[str, Any]:
+    """What tifffile is told of the samples of a page, with alpha or without."""
+    samples, colours = spec.channels + alpha, 3 if spec.channels == 3 and not spec.metadata.planes else 1
+    return {
+        "shape": (*size[::-1], samples) if samples > 1 else size[::-1],
+        "photometric": "rgb" if colours == 3 else "minisblack",
+        "planarconfig": "contig" if samples > 1 else None,
+        "extrasamples": ["unspecified"] * (spec.channels - colours) + ["unassalpha"] * alpha or None,
+    }
 
 
-def _has_mask(spec: ImageSpec) -> bool:
-    """Check whether transparency goes onto a page of its own."""
-    return spec.transparent and spec.channels == 1
+def tiled(dtype: np.dtype[Any]) -> dict[str, Any]:
+    """What tifffile is told of every page: its tiles are packed by libdeflate, always to the same bytes.
+
+    Differences of neighbours are stored of whole numbers; of floating point few programs can read them.
+    """
+    packing = {"compression": "zlib", "compressionargs": {"level": _DEFLATE_LEVEL}, "predictor": dtype.kind == "u"}
+    return {"dtype": dtype, "tile": (TILE, TILE), **packing, "software": "rdstitch"}
 
 
-def _write_page(
-    tiff: "tifffile.TiffWriter",
-    spec: ImageSpec,
-    size: tuple[int, int],
-    tiles: Iterator[bytes],
-    tags: list[ExtraTag],
-    kind: int,
-) -> None:
-    """Write one page from all its tiles, as they stand in the file."""
-    width, height = size
-    transparent = spec.transparent and not _has_mask(spec)
-    samples = spec.channels + transparent
-    colour = 3 if spec.channels == 3 and not spec.metadata.planes else 1
-    extra = ["unspecified"] * (spec.channels - colour) + ["unassalpha"] * transparent
-    dpi = None if kind else spec.metadata.resolution
-    tiff.write(
-        tiles,
-        shape=(height, width, samples) if samples > 1 else (height, width),
-        dtype=spec.dtype,
-        photometric="rgb" if colour == 3 else "minisblack",
-        planarconfig="contig" if samples > 1 else None,
-        extrasamples=extra or None,
-        tile=(TILE, TILE),
-        compression="zlib",
-        predictor=has_predictor(spec.dtype),
-        buffersize=_BUFFER,
-        metadata=None,
-        software="rdstitch",
-        subfiletype=kind,
-        resolution=dpi,
-        resolutionunit="inch" if dpi else None,
-        iccprofile=None if kind else spec.metadata.icc_profile or None,
-        extratags=tags,
-    )
-
-
-def _without_alpha(strips: Iterable[NDArray[Any]], mask: list[bytes]) -> Iterator[NDArray[Any]]:
+def _without_alpha(strips: Iterable[AnyArray], mask: list[bytes]) -> Iterator[AnyArray]:
     """The strips without alpha; tiles of where that is not 0, one bit a pixel, are added to ``mask`` as stored."""
     for strip in strips:
         bits = (np.packbits(tile[..., 0], axis=1) for tile in tiles_of([strip[..., -1:] > 0]))
-        mask += [_deflated(tile) for tile in bits]
+        mask += [bytes(imagecodecs.deflate_encode(tile.tobytes(), _DEFLATE_LEVEL)) for tile in bits]
         yield strip[..., :-1]
-
-
-def _write_mask(tiff: "tifffile.TiffWriter", size: tuple[int, int], tiles: list[bytes], kind: int) -> None:
-    """Write the page that says where the page before it has an image."""
-    tiff.write(
-        iter(tiles),
-        shape=size[::-1],
-        dtype=np.bool_,
-        photometric="mask",
-        tile=(TILE, TILE),
-        compression="zlib",
-        metadata=None,
-        software="rdstitch",
-        subfiletype=kind,
-    )
 
 
 def _band_names(spec: ImageSpec) -> Iterator[ExtraTag]:
@@ -185,7 +149,7 @@ def copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:
                 yield int(tag), 2, 0, text, True
 
 
-def tiles_of(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+def tiles_of(strips: Iterable[AnyArray]) -> Iterator[AnyArray]:
     """Tiles in the order of the file; those at the right and lower border completed."""
     for strip in strips:
         for y in range(0, strip.shape[0], TILE):
@@ -193,32 +157,3 @@ def tiles_of(strips: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
                 tile = strip[y : y + TILE, x : x + TILE]
                 missing = [(0, TILE - n) for n in tile.shape[:2]] + [(0, 0)]
                 yield np.pad(tile, missing) if any(b for _, b in missing) else tile
-
-
-def has_predictor(dtype: np.dtype[Any]) -> bool:
-    """Check whether differences of neighbours are stored; what is usual for floating point, few programs can read."""
-    return dtype.kind == "u"
-
-
-def _encoded(tiles: Iterable[NDArray[Any]], pool: ThreadPoolExecutor, workers: int) -> Iterator[bytes]:
-    """Tiles as they stand in the file, in their order; threads are a few tiles ahead of whoever takes them.
-
-    The compressor works without Python, beside what makes the next strips.
-    """
-    if workers == 1:
-        yield from map(encoded_tile, tiles)
-        return
-    yield from in_order_ahead(pool, encoded_tile, tiles, _AHEAD * workers)
-
-
-def encoded_tile(tile: NDArray[Any]) -> bytes:
-    """A tile (h, w, C) as it stands in the file."""
-    stored = tile.copy()
-    if has_predictor(tile.dtype):
-        stored[:, 1:] -= tile[:, :-1]
-    return _deflated(stored)
-
-
-def _deflated(stored: NDArray[Any]) -> bytes:
-    """Compressed by libdeflate, which is fast, and makes the same bytes of the same samples every time."""
-    return bytes(imagecodecs.deflate_encode(stored.tobytes(), _DEFLATE_LEVEL))

@@ -92,7 +92,6 @@ def _directory(page: _Page, order: str, room: int, place: int, following: int, o
 
 
 def _head(room: int) -> int:
-    """Bytes of the number of entries."""
     return 8 if room == 8 else 2
 
 

@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import UInt8Array
 from rdstitch.errors import InputError, OutputError
 from rdstitch.io.opening import check_readable
-from rdstitch.system.opencv_state import silent_opencv
+from rdstitch.system.native_threads import silent_opencv
 
 _FFMPEG_LEVEL, _FFMPEG_QUIET = "OPENCV_FFMPEG_LOGLEVEL", "-8"
 _ffmpeg_unloaded = Lock()  # until the first video of the process
@@ -30,7 +30,7 @@ class VideoFrame(NamedTuple):
     timestamp: float
 
 
-def grey_frames(path: Path) -> Iterator[NDArray[np.uint8] | None]:
+def grey_frames(path: Path) -> Iterator[UInt8Array | None]:
     """All frames of a video, (H, W); None where one cannot be decoded."""
     for _, _, capture in grabbed_frames(path):
         decoded, frame = capture.retrieve()

@@ -9,23 +9,22 @@ import os
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.errors import ArgumentError
 from rdstitch.io.deepzoom import write_deep_zoom
 from rdstitch.io.fingerprint import Fingerprint, fingerprint
 from rdstitch.io.formats import check_format
 from rdstitch.io.metadata import Metadata
-from rdstitch.io.ome_tiff import OME_SUFFIXES, write_ome_tiff
-from rdstitch.io.ome_zarr import write_ome_zarr
 from rdstitch.io.samples import OPAQUE
 from rdstitch.io.strips import STRIP_ROWS, ImageSpec, Strip, as_eight_bit, check_strips
 from rdstitch.io.tiff import ExtraTag, write_tiff
 from rdstitch.io.write_jpeg import jpeg_pieces
+from rdstitch.io.write_ome import OME_SUFFIXES, write_ome_tiff, write_ome_zarr
 from rdstitch.io.write_png import png_pieces
 from rdstitch.results.messages import Message
 from rdstitch.system.output_checks import check_folder, is_zarr, naming, tiles_folder
@@ -39,8 +38,8 @@ _ROWS_AT_A_TIME = 4 * STRIP_ROWS
 
 def write_image(
     path: str | Path,
-    pixels: NDArray[Any],
-    alpha: NDArray[np.uint8] | None = None,
+    pixels: AnyArray,
+    alpha: UInt8Array | None = None,
     metadata: Metadata | None = None,
     *,
     quality: int = 95,

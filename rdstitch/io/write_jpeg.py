@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, UInt8Array
 from rdstitch.errors import LimitError
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.strips import ImageSpec, Strip, as_eight_bit
@@ -30,12 +30,12 @@ def jpeg_pieces(spec: ImageSpec, strips: Iterable[Strip], workers: int = 1) -> I
     """The pieces of a JPEG file, three strips in memory at a time; transparency becomes the background."""
     first = True
     for data in _encoded(spec, strips, workers):
-        head, scan = _header_and_scan(data)
+        scan = _segment_end(data, _segment_of(data, _START_OF_SCAN))
         if first:
-            yield from _embedded(_with_height(head, spec.size[1]), spec.metadata)
+            yield from _embedded(_with_height(data[:scan], spec.size[1]), spec.metadata)
         else:
             yield _RESTART_7
-        yield scan
+        yield memoryview(data)[scan : -len(_END_OF_IMAGE)]
         first = False
     yield _END_OF_IMAGE
 
@@ -49,7 +49,7 @@ def _encoded(spec: ImageSpec, strips: Iterable[Strip], workers: int) -> Iterator
         yield from in_order_ahead(pool, lambda strip: _jpeg(spec, *strip), strips, _ENCODERS)
 
 
-def _jpeg(spec: ImageSpec, samples: NDArray[np.generic], alpha: NDArray[np.uint8] | None) -> bytes:
+def _jpeg(spec: ImageSpec, samples: AnyArray, alpha: UInt8Array | None) -> bytes:
     """One strip as a JPEG file of its own, with a restart marker after each row of blocks."""
     eight = as_eight_bit(samples)
     if spec.channels == 1:
@@ -69,12 +69,6 @@ def _jpeg(spec: ImageSpec, samples: NDArray[np.generic], alpha: NDArray[np.uint8
     if not done:
         raise LimitError(f"{spec.size[0]} x {spec.size[1]} pixels cannot be encoded as JPEG; write a .tif")
     return np.asarray(data, dtype=np.uint8).tobytes()
-
-
-def _header_and_scan(data: bytes) -> tuple[bytes, memoryview]:
-    """Everything up to the scan, and the scan without the end marker."""
-    position = _segment_end(data, _segment_of(data, _START_OF_SCAN))
-    return data[:position], memoryview(data)[position : -len(_END_OF_IMAGE)]
 
 
 def _with_height(head: bytes, height: int) -> bytes:

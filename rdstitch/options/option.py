@@ -7,6 +7,7 @@ large is imported here or by the modules of the options, so that ``--help`` is q
 
 import math
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum, StrEnum, auto
 from inspect import isclass
@@ -120,11 +121,17 @@ class Declared:
         """Whether a value names a file or folder that is read."""
         return self.option.file is FileUse.READ and isinstance(value, str | PathLike) and value not in self.words
 
-    def fits(self, value: Any) -> bool:
-        """Check a value; of texts and files only that they are none of another type."""
-        if value is None or (isinstance(value, str) and value in self.words):
-            return value is not None or self.optional
-        return any(_fits(value, kind, self.option) for kind in self.types)
+    def taken(self, value: Any) -> Any:
+        """The value, of Python's own numbers and tuples; of texts and files only that they are none of another type.
+
+        ArgumentError where it may not have it.
+        """
+        if (value is None and self.optional) or (isinstance(value, str) and value in self.words):
+            return value
+        for kind in self.types if value is not None else ():
+            with suppress(TypeError, ValueError):
+                return _taken(value, kind, self.option)
+        raise ArgumentError(f"{self.name} must be {self.expected}, not {value!r}")
 
 
 def declaration(name: str, annotation: Any) -> Declared | None:
@@ -171,7 +178,7 @@ class Options:
             value = getattr(self, name)
             if isinstance(value, str) and option.types == (Path,):
                 value = Path(value)
-            object.__setattr__(self, name, checked(option, value))
+            object.__setattr__(self, name, option.taken(value))
         for each in fields(self):
             kind: Any = each.default_factory
             if isclass(kind) and issubclass(kind, Options):
@@ -223,37 +230,11 @@ def with_fields(options: AnyOptions, given: dict[str, Any], others: Iterable[str
     return replace(options, **given)
 
 
-def checked(option: Declared, value: Any) -> Any:
-    """The value, of Python's own numbers and tuples, of an option that may have it."""
-    plain = _plain(value) if any(kind in (bool, int, float) or get_origin(kind) for kind in option.types) else value
-    if not option.fits(plain):
-        raise ArgumentError(f"{option.name} must be {option.expected}, not {value!r}")
-    return _with_floats(plain, option.types, option.option)
-
-
 def check_parameter(name: str, annotation: Any, value: Any) -> None:
     """Refuse a parameter's value that its annotation does not allow."""
     entry = declaration(name, Annotated[annotation, Option("")])
     assert entry is not None
-    checked(entry, value)
-
-
-def _plain(value: Any) -> Any:
-    """NumPy's numbers and arrays, which are no truth values, as Python's; lists as tuples."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    is_list = isinstance(value, Sequence) and not isinstance(value, str | bytes)
-    return tuple(map(_plain, value)) if is_list else value
-
-
-def _with_floats(value: Any, types: Sequence[Any], option: Option) -> Any:
-    """The same with floats for whole numbers where the type that it fits has floats."""
-    kind = next((each for each in types if _fits(value, each, option)), None)
-    if get_origin(kind) is tuple:
-        parts = get_args(kind)
-        kinds = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
-        return tuple(_with_floats(item, [part], option) for item, part in zip(value, kinds, strict=True))
-    return float(value) if kind is float else value
+    entry.taken(value)
 
 
 def documented(kind: Class) -> Class:
@@ -268,21 +249,27 @@ def _members(kind: Any) -> Sequence[Any]:
     return [m for each in get_args(kind) for m in _members(each)] if get_origin(kind) in (Union, UnionType) else [kind]
 
 
-def _fits(value: Any, kind: Any, option: Option) -> bool:
+def _taken(value: Any, kind: Any, option: Option) -> Any:
+    """The value as one of a type; ValueError or TypeError where it is none."""
+    if (kind in (bool, int, float) or get_origin(kind)) and hasattr(value, "tolist"):  # NumPy's
+        value = value.tolist()
     if get_origin(kind) is tuple:
+        if not isinstance(value, Sequence) or isinstance(value, str | bytes):
+            raise TypeError
         parts = get_args(kind)
-        if not isinstance(value, tuple):
-            return False
-        if parts[-1] is Ellipsis:
-            return all(_fits(item, parts[0], option) for item in value)
-        return len(value) == len(parts) and all(map(_fits, value, parts, [option] * len(parts)))
+        kinds = parts[:1] * len(value) if parts[-1] is Ellipsis else parts
+        return tuple(_taken(item, part, option) for item, part in zip(value, kinds, strict=True))
     if kind in (int, float):
         number = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
-        return number and value in option.within
-    if isinstance(kind, ForwardRef):  # names of classes that are not imported here; what is like an array, NumPy says
+        fits = number and value in option.within
+    elif isinstance(kind, ForwardRef):  # names of classes that are not imported here; what is like an array, NumPy says
         known, names = kind.__forward_arg__.split(" | "), {base.__name__ for base in type(value).__mro__}
-        return "ArrayLike" in known or isinstance(value, PathLike) or not names.isdisjoint(known)
-    return isinstance(value, {str: str, Path: PathLike, bool: bool}.get(kind, object))
+        fits = "ArrayLike" in known or isinstance(value, PathLike) or not names.isdisjoint(known)
+    else:
+        fits = isinstance(value, {str: str, Path: PathLike, bool: bool}.get(kind, object))
+    if not fits:
+        raise ValueError
+    return float(value) if kind is float else value
 
 
 def _in_words(kind: Any, option: Option) -> str:

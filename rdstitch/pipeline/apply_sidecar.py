@@ -28,7 +28,7 @@ from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages, SavedGrid
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
 from rdstitch.sidecar.recomposition import Recomposition
-from rdstitch.sidecar.write_applied import applied_sidecar
+from rdstitch.sidecar.write import applied_sidecar
 from rdstitch.stage.tile_inputs import with_position_folders
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import json_bytes

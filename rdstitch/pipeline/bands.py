@@ -15,12 +15,12 @@ from rdstitch.inputs.find import FoundImages
 from rdstitch.inputs.frame import Frame, Images
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import read_sources
-from rdstitch.io import ImageSpec, write_strips
 from rdstitch.io.fingerprint import fingerprint
 from rdstitch.io.metadata import Metadata
-from rdstitch.io.ome_tiff import OME_SUFFIXES
-from rdstitch.io.strips import Strip
+from rdstitch.io.strips import ImageSpec, Strip
 from rdstitch.io.tiff import written_strips
+from rdstitch.io.write import write_strips
+from rdstitch.io.write_ome import OME_SUFFIXES
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions

@@ -9,7 +9,7 @@ import numpy as np
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.errors import InputError
-from rdstitch.inputs.frame import Named
+from rdstitch.inputs.frame import Named, frame_numbers
 from rdstitch.inputs.odometry import Odometry
 from rdstitch.inputs.rosbag import odometry_in_bag, only_bag
 from rdstitch.inputs.source import Source
@@ -46,7 +46,7 @@ def camera_path(
         length_std = registration.alignment.length_std
         path, of_odometry = _along_odometry(path, sources, odometry, length_std, keep_unit=height is not None)
         messages += of_odometry
-    numbers = [source.number(k) for k, source in enumerate(sources)]
+    numbers = frame_numbers([source.frame for source in sources])
     return path.labelled([source.name for source in sources], numbers, timestamps_of(sources)), messages
 
 

@@ -11,7 +11,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.export.layers import layer_files, stage_layers
 from rdstitch.export.map_server import check_map_server, map_files, write_map
 from rdstitch.export.poses_files import poses_file
-from rdstitch.export.write_trajectory import check_bag
+from rdstitch.export.trajectory_files import check_bag
 from rdstitch.georeferencing.georeference import world_file_paths
 from rdstitch.georeferencing.place_on_map import MIN_POSITIONS, has_place
 from rdstitch.inputs.source import Source

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
 from rdstitch.errors import RegistrationError
-from rdstitch.export.trajectory_files import has_times, path_as_svg
-from rdstitch.export.write_trajectory import write_trajectory
+from rdstitch.export.trajectory_files import has_times, path_as_svg, write_trajectory
 from rdstitch.inputs.find import FoundImages
 from rdstitch.inputs.frame import Images, frame_numbers
 from rdstitch.inputs.input_guard import InputGuard
@@ -216,8 +215,7 @@ def trajectory(
     output : path, optional
         File to write.
     layout : str
-        "csv", "tum" or "kitti", see :mod:`rdstitch.export.trajectory_files`; "bag": ``nav_msgs/Odometry``, see
-        :mod:`rdstitch.export.write_trajectory`.
+        "csv", "tum", "kitti" or "bag", see :mod:`rdstitch.export.trajectory_files`.
     plot : path, optional
         SVG file to draw the path to.
     height : float, optional

@@ -36,20 +36,16 @@ def lens_curve(registration: Registration, residuals: Sequence[LinkResiduals]) -
         "Lens curve",
         "How many pixels farther from the distortion centre the lens measures a ray than the one-parameter lens with "
         f"λ = {alignment.distortion:.4f} (red) does, with twice the standard deviation on either side. "
-        f"{_support(camera, _matched_points(camera, residuals), farthest)}",
+        f"{_support(camera, residuals, farthest)}",
         element("ul", (element("li", text) for text in describe_lens(alignment, camera))),
         _curve(camera, np.linspace(0.0, farthest, _SAMPLES + 1)[1:]),
     )
 
 
-def _matched_points(camera: Camera, residuals: Sequence[LinkResiduals]) -> FloatArray:
-    """Where the matches that agree with the alignment are, pixels of images of one camera's size, (N, 2)."""
+def _support(camera: Camera, residuals: Sequence[LinkResiduals], farthest: float) -> str:
+    """Where in an image of one camera's size there are matches that agree with the alignment, one sentence."""
     points = [camera.denormalize(link.camera.normalize(link.points)) for link in residuals]
-    return np.concatenate([np.empty((0, 2)), *points])
-
-
-def _support(camera: Camera, places: FloatArray, farthest: float) -> str:
-    """Where in the image there are matches, one sentence."""
+    places = np.concatenate([np.empty((0, 2)), *points])
     if not len(places):
         return "No match supports it."
     across, down = _CELLS

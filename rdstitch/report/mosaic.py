@@ -64,7 +64,6 @@ def seam_dots(seams: SeamQuality, scale: float, spacing: float) -> list[tuple[fl
 
 
 def _broken_seams(result: StitchResult) -> str:
-    """Whether the seams hold, in one line."""
     seams = result.seams
     if not len(seams.places):
         return ""

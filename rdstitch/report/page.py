@@ -95,11 +95,7 @@ def report_page(
         summary(registration, stitched),
         notices(registration),
         stage_section(registration),
-        *(
-            []
-            if stitched is None
-            else [mosaic_section(stitched, image), place_section(stitched), local_alignment(stitched)]
-        ),
+        *([mosaic_section(stitched, image), place_section(stitched), local_alignment(stitched)] if stitched else []),
         match_graph(registration),
         votes(registration),
         lens_curve(registration, residuals),

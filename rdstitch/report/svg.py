@@ -6,9 +6,8 @@ from html import escape
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import AnyArray, FloatArray
 from rdstitch.errors import InputError
 from rdstitch.inputs.source import Source
 from rdstitch.io.preview import encode_preview
@@ -36,7 +35,10 @@ def joined(*content: Content) -> Markup:
 
 def element(name: str, *content: Content, **attributes: Any) -> Markup:
     """One element; ``stroke_width`` becomes ``stroke-width``, ``class_`` becomes ``class``."""
-    given = "".join(f' {key.rstrip("_").replace("_", "-")}="{_text(value)}"' for key, value in attributes.items())
+    texts = {
+        key: f"{value:.2f}" if isinstance(value, float) else escape(str(value)) for key, value in attributes.items()
+    }
+    given = "".join(f' {key.rstrip("_").replace("_", "-")}="{text}"' for key, text in texts.items())
     return Markup(f"<{name}{given}>" if name in _VOID else f"<{name}{given}>{joined(*content)}</{name}>")
 
 
@@ -94,12 +96,6 @@ def section(title: str, explanation: str, *content: Content) -> Markup:
     return element("section", element("h2", title), explained, *content)
 
 
-def _text(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.2f}"
-    return escape(str(value))
-
-
 def of_source(source: Source, side: int) -> str | None:
     """A thumbnail of an input image; None where it is gone, as frames of videos are."""
     try:
@@ -109,6 +105,6 @@ def of_source(source: Source, side: int) -> str | None:
         return None
 
 
-def data_address(pixels: NDArray[Any], side: int) -> str:
+def data_address(pixels: AnyArray, side: int) -> str:
     """An image of any sample type as JPEG inside a ``data:`` address, its longer side at most ``side`` pixels."""
     return "data:image/jpeg;base64," + base64.b64encode(encode_preview(pixels, side)).decode("ascii")

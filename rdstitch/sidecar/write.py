@@ -1,4 +1,4 @@
-"""The sidecar of a stitched image: everything that was estimated, as JSON beside it."""
+"""The sidecar of a stitched image: everything that was estimated, as JSON beside it; and of one composed again."""
 
 import dataclasses
 import platform
@@ -7,14 +7,20 @@ from typing import Any, cast
 
 import cv2
 import numpy as np
+from msgspec import UNSET
+from msgspec.structs import replace as replace_fields
 
-from rdstitch.geometry.camera_record import CameraRecord, camera_record
+from rdstitch.geometry.camera import Camera
+from rdstitch.geometry.camera_record import CameraRecord, camera_record, lens_fields
+from rdstitch.geometry.exif_orientation import inverse
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.image_record import ImageRecord, PoseRecord, image_fields, placement_fields
 from rdstitch.sidecar.output_record import OutputRecord, SeamsRecord
-from rdstitch.sidecar.paths import recorded_path
+from rdstitch.sidecar.paths import rebased_path, recorded_path
+from rdstitch.sidecar.recomposition import Recomposition
 from rdstitch.sidecar.records import (
     VERSION,
+    Applied,
     Lens,
     LocalAlignmentRecord,
     Model,
@@ -23,7 +29,17 @@ from rdstitch.sidecar.records import (
     StageRecord,
     VerdictRecord,
 )
+from rdstitch.system.file_access import is_url
 from rdstitch.system.records import to_jsonable
+
+_OF_ANOTHER_LENS = {
+    "lambda_std": None,
+    "lambda_known": False,
+    "tilt_deg": None,
+    "rms_px": None,
+    "lens_reason": "that of another band, from what images of both show",
+}
+"""What is not known of the lens of another band."""
 
 
 def sidecar(result: StitchResult) -> dict[str, Any]:
@@ -83,6 +99,90 @@ def _images(result: StitchResult) -> list[ImageRecord]:
         ImageRecord(path.name, recorded_path(path, result.output), None, False, reason)
         for path, reason in reasons.items()
     ]
+
+
+def applied_sidecar(result: Recomposition, *, same_lens: bool) -> dict[str, Any]:
+    """The sidecar of an image composed again: the saved registration, with the images that are in it now.
+
+    It can be applied like any other; pairs stay in the one that was applied.
+    """
+    saved, record = result.saved, result.saved.record
+    reference = result.sources[saved.reference] or result.placed.sources[0]
+    stored_camera = reference.camera.turned(inverse(reference.metadata.orientation))
+    camera = _with_errors_of(record.camera, stored_camera) if same_lens else camera_record(stored_camera)
+    placed = (index for index, source in enumerate(result.sources) if source is not None)
+    positions = {index: k for k, index in enumerate(placed)}  # of registered images among those of the output
+    record = replace_fields(
+        record,
+        **({} if same_lens else _OF_ANOTHER_LENS),
+        **camera_fields(camera),
+        version=VERSION,
+        reference=reference.name,
+        output=OutputRecord.of(result),
+        seams=SeamsRecord.of(result),
+        images=[
+            _used_image(result, index, positions[index], same_lens=same_lens)
+            if index in positions
+            else _unused_image(result, index)
+            for index in range(len(saved.images))
+        ],
+        pairs=[],
+        options={**record.options, "composite": result.options.composite},
+        versions=versions(),
+        applied=Applied(recorded_path(saved.path, result.output), result.matched),
+    )
+    content: dict[str, Any] = to_jsonable(record)
+    return content
+
+
+def _with_errors_of(registered: CameraRecord, camera: Camera) -> CameraRecord:
+    """The record of a camera of the lens that was registered, perhaps on images of another size, with its errors."""
+    record, focal_std = camera_record(camera), registered.focal_std_px
+    if focal_std is not None and registered.focal_px and record.focal_px:
+        focal_std *= record.focal_px / registered.focal_px
+    return replace_fields(
+        record,
+        lambda_std=registered.lambda_std,
+        lambda_observable=registered.lambda_observable,
+        lens_covariance=registered.lens_covariance,
+        focal_std_px=focal_std,
+        tilt_deg=registered.tilt_deg,
+        tilt_std_deg=registered.tilt_std_deg,
+    )
+
+
+def _used_image(result: Recomposition, index: int, position: int, *, same_lens: bool) -> ImageRecord:
+    image, source = result.saved.images[index], result.placed.sources[position]
+    original = result.saved.original(image)
+    is_original = original is not None and original.resolve() == source.path.resolve()
+    return replace_fields(
+        image,
+        features=image.features if is_original else None,
+        pose=image.pose if same_lens else None,
+        lambda2=UNSET,
+        **image_fields(source, source.camera, result.output),
+        **placement_fields(result, position),
+    )
+
+
+def _unused_image(result: Recomposition, index: int) -> ImageRecord:
+    """The record of a registered image that is not in the output."""
+    image, left_out = result.saved.images[index], result.left_out.get(index)
+    path = image.path
+    # An array has a name without an ending, and no file.
+    if not is_url(path) and (Path(path).suffix or result.saved.original(image)):
+        path = rebased_path(Path(path), result.saved.path.parent, result.output)
+    return replace_fields(
+        image,
+        path=path,
+        used=False,
+        reason=image.reason if left_out is None else left_out.text,
+        to_plane=None,
+        to_output=None,
+        pose=None,
+        lambda2=UNSET,
+        **({} if image.camera is None else lens_fields(image.camera)),
+    )
 
 
 def versions() -> dict[str, str]:

@@ -22,8 +22,6 @@ _FISHEYES: dict[str, tuple[Callable[[FloatArray], FloatArray], Callable[[FloatAr
 
 @dataclass(frozen=True)
 class _FixedFocalLens:
-    """A lens with a focal length and a principal point."""
-
     image_size: tuple[int, int]  # width and height, pixels
     focal: float  # at the centre, pixels
     # from the image centre to the principal point, pixels

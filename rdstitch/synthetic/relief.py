@@ -5,12 +5,9 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import BoolArray, Float32Array, FloatArray
 from rdstitch.errors import ArgumentError
-
-HeightMap = NDArray[np.float32]
 
 # A ray moves at most this far over the ground between two levels at which it is tested, texels; but see _MAX_LEVELS.
 _TEXELS_PER_LEVEL = 2.0
@@ -31,7 +28,7 @@ class Relief:
     outside of the map, at the lowest height of it.
     """
 
-    height: HeightMap
+    height: Float32Array
 
     def __post_init__(self) -> None:
         if self.height.ndim != 2 or not self.height.size or max(self.height.shape) >= _TOO_LONG:
@@ -68,7 +65,7 @@ class Relief:
         travel = float(np.fmax.reduce(np.abs(along), axis=None, initial=0.0)) * (top - bottom) / height
         steps = int(np.clip(np.ceil(travel / _TEXELS_PER_LEVEL), 1, _MAX_LEVELS))
 
-        def in_ground(level: NDArray[np.float32]) -> NDArray[np.bool_]:
+        def in_ground(level: Float32Array) -> BoolArray:
             places = start + along * (np.float32(1.0) - level / np.float32(height))[..., None]
             places[np.isnan(places)] = NOWHERE
             outside = cv2.BORDER_CONSTANT, (bottom, 0.0, 0.0, 0.0)
@@ -132,6 +129,6 @@ RELIEFS: dict[str, Callable[..., Relief]] = {"bumps": bumps, "buildings": buildi
 """Makers of relief by the kind of ground; each takes ``(size, seed, height=...)``."""
 
 
-def _scaled(ground: HeightMap, height: float) -> HeightMap:
+def _scaled(ground: Float32Array, height: float) -> Float32Array:
     low, high = float(ground.min()), float(ground.max())
     return ((ground - np.float32(low)) * np.float32(height / max(high - low, 1e-12))).astype(np.float32)

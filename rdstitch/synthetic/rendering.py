@@ -8,18 +8,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from rdstitch.arrays import FloatArray
+from rdstitch.arrays import AnyArray, BoolArray, Float32Array, FloatArray
 from rdstitch.errors import ArgumentError, OutputError
+from rdstitch.io.write import write_image
 from rdstitch.synthetic.lenses import Lens
 from rdstitch.synthetic.poses import Poses, fit_to_plane, pixels_of_texels, plane_outline, texels_of_pixels
 from rdstitch.synthetic.relief import NOWHERE, Relief
-from rdstitch.synthetic.textures import LinearPixels, Texture
+from rdstitch.synthetic.textures import Texture
 
 _PIXELS_PER_STRIP = 400_000
 _SIXTEEN_BITS = (".png", ".tif", ".tiff")
@@ -111,7 +111,7 @@ class RenderedSequence:
         """
         return pixels_of_texels(self.lens, self.from_plane(index), points)
 
-    def frame(self, index: int) -> NDArray[Any]:
+    def frame(self, index: int) -> AnyArray:
         """Render one image, uint8 or uint16 (h, w) or RGB (h, w, 3), black where the texture ends."""
         width, height = self.lens.image_size
         settings = self.photometry
@@ -127,7 +127,7 @@ class RenderedSequence:
             np.rint(np.clip(light, 0.0, 1.0, out=light) * np.float32(full), out=image[top:bottom], casting="unsafe")
         return image[:, :, 0] if image.shape[2] == 1 else image
 
-    def frames(self) -> list[NDArray[Any]]:
+    def frames(self) -> list[AnyArray]:
         """Render all images."""
         return [self.frame(index) for index in range(len(self))]
 
@@ -136,22 +136,13 @@ class RenderedSequence:
         paths = []
         for index in range(len(self)):
             path = Path(folder) / name.format(index)
-            image = self.frame(index)
-            bgr = image if image.ndim == 2 else np.ascontiguousarray(image[:, :, ::-1])
-            eight_only = image.dtype == np.uint16 and path.suffix.lower() not in _SIXTEEN_BITS
-            if eight_only or not cv2.haveImageWriter(path.name):
+            if self.photometry.bits > 8 and path.suffix.lower() not in _SIXTEEN_BITS:
                 raise OutputError(f"{path}: cannot hold images of {self.photometry.bits} bits; use .png or .tif")
-            encodes, encoded = cv2.imencode(path.suffix, bgr)
-            if not encodes:
-                raise OutputError(f"{path}: OpenCV cannot encode it")
-            try:
-                path.write_bytes(encoded.tobytes())
-            except OSError as error:
-                raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+            write_image(path, self.frame(index))
             paths.append(path)
         return paths
 
-    def reachable(self) -> NDArray[np.bool_]:
+    def reachable(self) -> BoolArray:
         """Mark the texels that any image shows."""
         width, height = self.texture.size
         mask = np.zeros((height, width), dtype=np.uint8)
@@ -160,7 +151,7 @@ class RenderedSequence:
             cv2.fillPoly(mask, [np.rint(points * 16.0).astype(np.int32)], 1, cv2.LINE_8, 4)
         return mask.astype(np.bool_)
 
-    def _light(self, index: int, top: int, bottom: int) -> LinearPixels:
+    def _light(self, index: int, top: int, bottom: int) -> Float32Array:
         """Rows ``top`` to ``bottom`` of an image without noise: what falls on the sensor."""
         settings = self.photometry
         width, height = self.lens.image_size
@@ -177,7 +168,7 @@ class RenderedSequence:
         blurred = cv2.GaussianBlur(light, (0, 0), settings.blur, borderType=cv2.BORDER_REPLICATE)
         return np.asarray(blurred, dtype=np.float32).reshape(light.shape)[apron:-apron]
 
-    def _sharp(self, index: int, top: int, bottom: int) -> LinearPixels:
+    def _sharp(self, index: int, top: int, bottom: int) -> Float32Array:
         """Rows ``top`` to ``bottom`` of the plane as a perfect lens and sensor see it, in [0, 1]."""
         u, v = np.arange(-1, self.lens.image_size[0] + 1), np.arange(top - 1, bottom + 1)
         wide = self.to_plane(index, np.stack(np.meshgrid(u, v), axis=-1))
@@ -209,7 +200,7 @@ def _samples_per_side(along: FloatArray, down: FloatArray) -> int:
     return int(np.clip(np.ceil(np.quantile(longest, 0.9)), 2, _MAX_SAMPLES_PER_SIDE))
 
 
-def _sample(texture: Texture, place: FloatArray) -> LinearPixels:
+def _sample(texture: Texture, place: FloatArray) -> Float32Array:
     """Texture interpolated at texels (h, w, 2), shape (h, w, channels); 0 outside and at NaN."""
     # NaN, a ray that meets nothing, is sent where nothing is, and does not count for the region that is needed.
     axes = [np.ascontiguousarray(place[..., k]) for k in (0, 1)]

@@ -6,15 +6,13 @@ levels or RGB in [0, 1].
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from rdstitch.arrays import AnyArray, Float32Array, FloatArray, Int32Array, IntArray, UInt8Array
 from rdstitch.errors import ArgumentError
-
-LinearPixels = NDArray[np.float32]
 
 # Periods of the layers of an endless texture, texels. Up to 100,000 no shift is within 100 of a multiple of all three.
 # (Two layers of 2039 and 1787 come within 12 at 14,284, and places so far apart look the same.)
@@ -46,7 +44,7 @@ class Texture(Protocol):
     def channels(self) -> int:
         """1 for grey, 3 for RGB."""
 
-    def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
+    def region(self, left: int, top: int, right: int, bottom: int) -> Float32Array:
         """Texels of a rectangle inside the texture, shape (bottom - top, right - left, channels), in [0, 1]."""
 
 
@@ -54,7 +52,7 @@ class Texture(Protocol):
 class ImageTexture:
     """An image as texture: uint8 or uint16 of full range, or float32 in [0, 1], (h, w) or (h, w, C)."""
 
-    pixels: NDArray[Any]
+    pixels: AnyArray
 
     def __post_init__(self) -> None:
         if self.pixels.ndim not in (2, 3) or self.pixels.size == 0:
@@ -72,10 +70,10 @@ class ImageTexture:
         """Number of channels; 3 are RGB."""
         return 1 if self.pixels.ndim == 2 else self.pixels.shape[2]
 
-    def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
+    def region(self, left: int, top: int, right: int, bottom: int) -> Float32Array:
         part = self.pixels[top:bottom, left:right]
         full = 1.0 if part.dtype == np.float32 else float(np.iinfo(part.dtype).max)
-        scaled: LinearPixels = part.astype(np.float32) / np.float32(full)
+        scaled: Float32Array = part.astype(np.float32) / np.float32(full)
         return scaled[:, :, None] if scaled.ndim == 2 else scaled
 
 
@@ -87,7 +85,7 @@ class EndlessTexture:
     seed: int
     channels: int = 3  # 1 for grey, 3 for RGB
 
-    def region(self, left: int, top: int, right: int, bottom: int) -> LinearPixels:
+    def region(self, left: int, top: int, right: int, bottom: int) -> Float32Array:
         x, y = np.arange(left, right), np.arange(top, bottom)
         layers = [_periodic_ground(period, (self.seed, period), self.channels) for period in LAYER_PERIODS]
         total = np.zeros((len(y), len(x), self.channels), dtype=np.float32)
@@ -135,7 +133,7 @@ def repeated(size: tuple[int, int], seed: int, period: int = 96) -> Texture:
 
 
 @lru_cache(maxsize=len(LAYER_PERIODS))  # 51 MB for the largest of them, in RGB
-def _periodic_ground(period: int, seed: tuple[int, int], channels: int) -> LinearPixels:
+def _periodic_ground(period: int, seed: tuple[int, int], channels: int) -> Float32Array:
     """Ground of ``period`` x ``period`` texels that continues across its borders."""
     rng = np.random.default_rng(seed)
     ground = _grained(_dead_leaves(rng, (period, period), channels, wrap=True), rng)
@@ -145,7 +143,7 @@ def _periodic_ground(period: int, seed: tuple[int, int], channels: int) -> Linea
 
 def _dead_leaves(
     rng: np.random.Generator, size: tuple[int, int], channels: int, *, wrap: bool, cover: float = 3.0
-) -> NDArray[np.uint8]:
+) -> UInt8Array:
     """Overlapping patches that cover the image ``cover`` times; with ``wrap``, also across its borders."""
     width, height = size
     smallest, largest = _MIN_RADIUS, max(6.0, min(_MAX_RADIUS, min(size) / 6.0))
@@ -167,14 +165,14 @@ def _dead_leaves(
     return canvas
 
 
-def _palette(rng: np.random.Generator, count: int, channels: int) -> NDArray[np.float64]:
+def _palette(rng: np.random.Generator, count: int, channels: int) -> FloatArray:
     """Colours of patches: a few materials, each with its own spread of brightness."""
     materials = rng.uniform(*_MATERIAL_GREY, (_MATERIALS, 1)) + rng.normal(0.0, _TINT, (_MATERIALS, channels))
     colour = materials[rng.integers(len(materials), size=count)] + rng.normal(0.0, _PATCH_SPREAD, (count, 1))
     return np.clip(colour, *_PATCH_GREY)
 
 
-def _leaf_outlines(rng: np.random.Generator, radius: NDArray[np.float64]) -> list[NDArray[np.int32]]:
+def _leaf_outlines(rng: np.random.Generator, radius: FloatArray) -> list[Int32Array]:
     """Outlines around the origin: polygons of 3-7 corners, ellipses, and streaks like roads and joints.
 
     In units of ``2 ** -_SUBPIXEL_BITS`` texels, as OpenCV draws them.
@@ -191,7 +189,7 @@ def _leaf_outlines(rng: np.random.Generator, radius: NDArray[np.float64]) -> lis
     axes = np.stack([np.stack([c, s], axis=-1), np.stack([-s, c], axis=-1) * flat[:, None]], axis=-2)
     axes *= (long * 2**_SUBPIXEL_BITS)[:, None, None]
 
-    outlines: list[NDArray[np.int32]] = [np.empty((0, 2), dtype=np.int32)] * count
+    outlines: list[Int32Array] = [np.empty((0, 2), dtype=np.int32)] * count
     for n in np.unique(corners):
         which = np.flatnonzero(corners == n)
         jitter = irregular[which, None] * rng.uniform(-1.0, 1.0, (len(which), n))
@@ -202,9 +200,7 @@ def _leaf_outlines(rng: np.random.Generator, radius: NDArray[np.float64]) -> lis
     return outlines
 
 
-def _wrapped(
-    center: NDArray[np.float64], reach: NDArray[np.float64], size: tuple[int, int]
-) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+def _wrapped(center: FloatArray, reach: FloatArray, size: tuple[int, int]) -> tuple[FloatArray, IntArray]:
     """All places at which leaves are drawn so that they continue across the borders, and the leaf of each."""
     shifts = np.array([(dx, dy) for dx in (-1.0, 0.0, 1.0) for dy in (-1.0, 0.0, 1.0)]) * size
     places = center[:, None, :] + shifts
@@ -213,7 +209,7 @@ def _wrapped(
     return places[owner, shift], owner
 
 
-def _grained(patches: NDArray[np.uint8], rng: np.random.Generator, strength: float = 0.05) -> LinearPixels:
+def _grained(patches: UInt8Array, rng: np.random.Generator, strength: float = 0.05) -> Float32Array:
     """Patches with periodic 1/f texture over them, in [0, 1]."""
     height, width = patches.shape[:2]
     frequency = np.hypot(np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)[None, :])
@@ -221,5 +217,5 @@ def _grained(patches: NDArray[np.uint8], rng: np.random.Generator, strength: flo
     white = rng.standard_normal((height, width), dtype=np.float32)
     grain = np.fft.irfft2(np.fft.rfft2(white) / frequency, s=(height, width))
     grain = (strength * grain / grain.std()).astype(np.float32)
-    image: LinearPixels = patches.astype(np.float32) / np.float32(255.0) + grain[:, :, None]
+    image: Float32Array = patches.astype(np.float32) / np.float32(255.0) + grain[:, :, None]
     return np.clip(image, 0.0, 1.0, out=image)

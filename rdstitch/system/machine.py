@@ -81,7 +81,6 @@ def _groups(root: Path, controller: str) -> Iterator[Path]:
 
 
 def _text(file: Path) -> str:
-    """Give what a file of the system says; empty where it says nothing."""
     try:
         return file.read_text()
     except (OSError, UnicodeDecodeError):

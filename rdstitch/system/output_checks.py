@@ -13,18 +13,6 @@ WRITABLE_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".dzi", 
 _LEVEL_NAME, _TILE_NAME = re.compile(r"[0-9]{1,2}"), re.compile(r"[0-9]+_[0-9]+\.jpg")
 
 
-def check_output(
-    path: str | Path,
-    overwrite: bool = False,
-    inputs: Iterable[str | Path] = (),
-    suffixes: Iterable[str] = WRITABLE_SUFFIXES,
-) -> Path:
-    """Find out before long work whether a file can be written, over none of the inputs; nothing is created."""
-    file = check_suffix(path, suffixes)
-    check_outputs([file], overwrite, inputs)
-    return file
-
-
 def check_suffix(path: str | Path, suffixes: Iterable[str] = WRITABLE_SUFFIXES) -> Path:
     """Refuse an output whose name does not say what it shall be; without suffixes any name will do."""
     file, known = Path(path), tuple(suffixes)

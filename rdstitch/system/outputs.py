@@ -177,35 +177,24 @@ class Outputs:
         if not item.place.exists():
             return
         if not self.overwrite:
-            raise _appeared(item.name)
+            raise OutputError(f"{item.name}: exists already; it has appeared during the run, and is kept")
         if item.check is None:
             item.staged.chmod(item.place.stat().st_mode & 0o777)
         else:
             item.check(item.place)
 
     def _place(self, item: _Item) -> None:
-        if item.check is not None:
-            self._place_folder(item)
+        if self.overwrite and item.check is not None:
+            replace_folder(item.staged, item.place)
         elif self.overwrite:
             item.staged.replace(item.place)
         else:
-            # A link replaces nothing; where a file system has none, the check a moment ago must do.
+            # These replace nothing; where a file system has no links, the check a moment ago must do.
             try:
-                os.link(item.staged, item.place)
+                (os.link if item.check is None else os.rename)(item.staged, item.place)
             except OSError:
                 self._check(item)
                 item.staged.replace(item.place)
-
-    def _place_folder(self, item: _Item) -> None:
-        if self.overwrite:
-            replace_folder(item.staged, item.place)
-            return
-        try:
-            item.staged.rename(item.place)
-        except OSError:
-            if item.place.exists():
-                raise _appeared(item.name) from None
-            raise
 
 
 def _place_of(name: Path) -> Path:
@@ -234,7 +223,3 @@ def replace_folder(new: Path, place: Path) -> None:
         if old.exists() and not place.exists():
             old.rename(place)
         raise
-
-
-def _appeared(name: Path) -> OutputError:
-    return OutputError(f"{name}: exists already; it has appeared during the run, and is kept")

@@ -77,27 +77,21 @@ def forget_peak_memory() -> None:
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
-class _Scratch:
-    """Memory that the threads of this process take for a while, and give back."""
-
-    def __init__(self) -> None:
-        self._changed, self._taken = Condition(), 0
-
-    @contextmanager
-    def take(self, size: int) -> Iterator[None]:
-        """Wait until there is room for so many bytes; one thread alone always has it.
-
-        Blocks of it must not be nested: two threads would wait for each other.
-        """
-        with self._changed:
-            self._changed.wait_for(lambda: self._taken == 0 or self._taken + size <= _SCRATCH)
-            self._taken += size
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._taken -= size
-                self._changed.notify_all()
+_scratch_changed, _scratch_taken = Condition(), [0]
 
 
-scratch_memory = _Scratch().take
+@contextmanager
+def scratch_memory(size: int) -> Iterator[None]:
+    """Wait until there is room for so many bytes that a thread takes for a while; one thread alone always has it.
+
+    Blocks of it must not be nested: two threads would wait for each other.
+    """
+    with _scratch_changed:
+        _scratch_changed.wait_for(lambda: _scratch_taken[0] == 0 or _scratch_taken[0] + size <= _SCRATCH)
+        _scratch_taken[0] += size
+    try:
+        yield
+    finally:
+        with _scratch_changed:
+            _scratch_taken[0] -= size
+            _scratch_changed.notify_all()

@@ -7,16 +7,12 @@ Progress = Callable[[str, int, int], None]
 """Called with the name of a stage, the number of steps done, and their total."""
 
 
-def silent(stage: str, done: int, total: int) -> None:
-    """A progress that nobody watches."""
-
-
 FractionProgress = Callable[[float], None]
 """Called with the fraction of the work that is done, 0 to 1."""
 
 
-def no_progress(fraction: float) -> None:
-    """A progress of one stage that nobody watches."""
+def silent(*_done: object) -> None:
+    """A progress of either kind that nobody watches."""
 
 
 class StageTimer:

@@ -11,7 +11,7 @@ from examples.judging import PlaneComparison, compare_with_plane, registration_e
 from examples.judging.trajectories import compare_trajectories
 from examples.worlds.floor_drives import DISTORTION, PATHS, floor_drive, read_path, true_path
 from rdstitch.geometry.camera import Camera
-from rdstitch.io import read_image
+from rdstitch.io.read import read_image
 from rdstitch.synthetic import Photometry, RenderedSequence, grid_poses, ground, pair_poses, sequence_over
 from tests.cli.running import FAST, finished, start
 from tests.sampled import sampled

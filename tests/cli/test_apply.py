@@ -15,8 +15,8 @@ import pytest
 
 from rdstitch import CompositeOptions, apply, mosaic, write_report
 from rdstitch.errors import ArgumentError, InputError
-from rdstitch.io import read_image
 from rdstitch.io.metadata import read_metadata
+from rdstitch.io.read import read_image
 from rdstitch.sidecar.read import read_sidecar
 from tests.cli.running import CACHED, OPTIONS, Outcome, Run, copied, finished, sidecar_of, start
 

@@ -15,6 +15,7 @@ from PIL import Image
 import rdstitch
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.frame import Frame, as_inputs
+from rdstitch.io.read import read_image
 
 _OPTIONS = rdstitch.StitchOptions(workers=1, features=rdstitch.FeatureOptions(max_features=600))
 _RGB = replace(_OPTIONS, channel_order="rgb")
@@ -61,7 +62,7 @@ def test_images_of_pillow_are_in_their_own_colours(frames: list[Path], of_files:
     for image, frame in zip(images, frames, strict=True):
         (found,) = as_inputs(image)
         assert isinstance(found, Frame)
-        np.testing.assert_array_equal(found.decoded().pixels, rdstitch.io.read_image(frame).pixels)
+        np.testing.assert_array_equal(found.decoded().pixels, read_image(frame).pixels)
     result = rdstitch.pano(images, options=_OPTIONS)
     np.testing.assert_array_equal(result.image, of_files.image)
     sideways = images[0].copy()
@@ -110,7 +111,7 @@ def test_arrays_mix_with_paths_and_are_named(
 ) -> None:
     result = rdstitch.pano([frames[0], arrays[1], str(frames[2])], tmp_path / "mix.png", _OPTIONS)
     assert [source.name for source in result.registration.sources] == [frames[0].name, "image_0001", frames[2].name]
-    np.testing.assert_array_equal(result.image[..., ::-1], rdstitch.io.read_image(tmp_path / "mix.png").pixels)
+    np.testing.assert_array_equal(result.image[..., ::-1], read_image(tmp_path / "mix.png").pixels)
     again = rdstitch.apply(tmp_path / "mix.png.json", arrays)
     assert again.matched == "order"
     np.testing.assert_array_equal(again.composite.pixels[..., ::-1], result.image)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rdstitch.geometry.camera import Camera
-from rdstitch.io import read_image
+from rdstitch.io.read import read_image
 from tests.cli.running import FAST, Outcome, copied
 from tests.sampled import sampled
 

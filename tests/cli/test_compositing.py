@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from rdstitch_cli.main import cli
 
-from rdstitch.io import read_image
 from rdstitch.io.deepzoom import read_deep_zoom
+from rdstitch.io.read import read_image
 from tests.cli.running import CACHED, Run, sidecar_of
 
 

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rdstitch.io import read_image, write_image
+from rdstitch.io.read import read_image
+from rdstitch.io.write import write_image
 from rdstitch.synthetic.textures import ground
 from tests.cli.running import FAST, Run, copied, flight, rows_of, sidecar_of
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from examples.worlds.adverse_sets import adverse_set
-from rdstitch.io import read_image
+from rdstitch.io.read import read_image
 from tests.cli.running import CACHED, DISTORTION, Run, copied, sidecar_of
 
 LEG = (255, 0, 255)

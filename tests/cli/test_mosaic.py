@@ -14,7 +14,8 @@ from examples.judging import alignment_error
 from rdstitch.errors import LimitError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.find import FoundImages
-from rdstitch.io import read_image, write_image
+from rdstitch.io.read import read_image
+from rdstitch.io.write import write_image
 from rdstitch.matching import candidate_pairs
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.pipeline import blocks

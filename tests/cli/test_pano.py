@@ -9,7 +9,7 @@ import pytest
 
 from examples.judging import alignment_error, compare_with_plane
 from rdstitch.geometry.camera import Camera
-from rdstitch.io import read_image
+from rdstitch.io.read import read_image
 from rdstitch.synthetic import RenderedSequence
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, sidecar_of, transfers
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rdstitch.io import read_image
+from rdstitch.io.read import read_image
 from tests.cli.running import CACHED, FAST, Run, copied, finished, sidecar_of, start
 from tests.faults import OPERATIONS, Operation, failing_disk
 from tests.sampled import sampled

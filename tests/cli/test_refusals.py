@@ -15,7 +15,8 @@ from rdstitch.errors import ImpossibleCameraError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.camera_record import camera_json
 from rdstitch.inputs import source as sources
-from rdstitch.io import Metadata, read_image, read_metadata
+from rdstitch.io.metadata import Metadata, read_metadata
+from rdstitch.io.read import read_image
 from rdstitch.pipeline.registration import accept, register
 from rdstitch.sidecar import write
 from rdstitch.verification.verdict import judge

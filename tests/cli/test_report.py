@@ -16,8 +16,10 @@ from PIL import Image
 
 from rdstitch.compositing import CompositeOptions
 from rdstitch.compositing.seam_quality import SeamQuality
-from rdstitch.io import Metadata, preview, write_image
+from rdstitch.io import preview
+from rdstitch.io.metadata import Metadata
 from rdstitch.io.opening import MAX_IMAGE_GB
+from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline import recipes
 from rdstitch.pipeline.recipes import calibrate, pano

@@ -21,7 +21,7 @@ from rdstitch.camera_files import load_camera
 from rdstitch.camera_files.lens_models import RATIONAL, nearest_model
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.rosbag import camera_in_bag
-from rdstitch.io import read_image
+from rdstitch.io.read import read_image
 from rdstitch.synthetic import Photometry, RenderedSequence, ground, sequence_over
 from tests.cli.running import CACHED, DISTORTION, FAST, Run, finished, rows_of, start
 from tests.videos import write_video

@@ -15,7 +15,7 @@ from rdstitch_cli.flags import FilePath
 from rdstitch_cli.main import run
 from rdstitch_cli.terminal import Reporter, spell_out
 
-from rdstitch.io import read_image
+from rdstitch.io.read import read_image
 from rdstitch.pipeline import recipes
 from rdstitch.synthetic import ground
 from tests.cli.running import CACHED, DISTORTION, FAST, Outcome, Run, finished, start, state_of

@@ -9,7 +9,8 @@ from PIL import Image
 from rdstitch import undistort
 from rdstitch.errors import LimitError
 from rdstitch.geometry.camera import Camera
-from rdstitch.io import read_image, read_metadata
+from rdstitch.io.metadata import read_metadata
+from rdstitch.io.read import read_image
 from rdstitch.synthetic import RenderedSequence
 from tests.cli.running import DISTORTION, FAST, Run
 

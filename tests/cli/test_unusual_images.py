@@ -14,7 +14,7 @@ from PIL import Image
 
 import rdstitch as library
 from rdstitch.camera_files import load_camera
-from rdstitch.io import read_image
+from rdstitch.io.read import read_image
 from rdstitch.synthetic import FisheyeLens, ground
 from tests.cli.faulty import Make
 from tests.cli.running import CACHED, DISTORTION, Run, finished, sidecar_of, start

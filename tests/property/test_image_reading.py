@@ -17,7 +17,8 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from rdstitch.errors import InputError
-from rdstitch.io import DecodedImage, Metadata, read_image, read_metadata
+from rdstitch.io.metadata import Metadata, read_metadata
+from rdstitch.io.read import DecodedImage, read_image
 
 _XMP = (
     b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description drone-dji:GimbalYawDegree="+12.5" '

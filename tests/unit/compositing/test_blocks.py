@@ -20,7 +20,7 @@ from rdstitch.compositing.tables import CompositeTables
 from rdstitch.compositing.tiles import Block, OutputStrip
 from rdstitch.compositing.transparency import OPACITY_BYTES
 from rdstitch.errors import ArgumentError, LimitError
-from rdstitch.io import DecodedImage
+from rdstitch.io.read import DecodedImage
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply

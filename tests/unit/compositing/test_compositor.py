@@ -29,7 +29,8 @@ from rdstitch.compositing.source_images import ImageLoader
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
-from rdstitch.io import Metadata, read_image
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.read import read_image
 from rdstitch.synthetic.rendering import Photometry
 from tests.sampled import sampled
 

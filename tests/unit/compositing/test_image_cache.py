@@ -25,8 +25,7 @@ from rdstitch.compositing.source_images import ImageOnDisk, ImageReader, LoadedI
 from rdstitch.compositing.transparency import filled
 from rdstitch.errors import InputError
 from rdstitch.geometry.camera import Camera
-from rdstitch.io import DecodedImage
-from rdstitch.io.read import reduced
+from rdstitch.io.read import DecodedImage, reduced
 
 
 class DecodedImageCache:

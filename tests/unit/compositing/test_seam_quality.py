@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from rdstitch.compositing.boxes import Box, Float32Array
+from rdstitch.arrays import Float32Array
+from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.likeness import likeness
 from rdstitch.compositing.seam_quality import SeamBreak, SeamQuality, SeamTile, measure_seams
 from rdstitch.synthetic.textures import ground

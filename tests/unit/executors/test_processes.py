@@ -17,7 +17,7 @@ from rdstitch.errors import ArgumentError, InputError, LimitError
 from rdstitch.executors import ProcessExecutor, in_order, open_executor, processes
 from rdstitch.features import FeatureOptions
 from rdstitch.inputs.source import read_sources
-from rdstitch.io import write_image
+from rdstitch.io.write import write_image
 from rdstitch.pipeline.registration.detect_features import detect_batch
 from rdstitch.system.cache import Cache
 from tests.unit.executors import tasks

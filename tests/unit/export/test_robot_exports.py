@@ -11,12 +11,12 @@ import pytest
 from rdstitch.errors import ArgumentError, LimitError, OutputError
 from rdstitch.export.map_server import write_map
 from rdstitch.export.poses_files import poses_file
-from rdstitch.export.trajectory_files import path_as_svg
-from rdstitch.export.write_trajectory import write_trajectory
+from rdstitch.export.trajectory_files import path_as_svg, write_trajectory
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
 from rdstitch.inputs.rosbag import opened_bag
-from rdstitch.io import read_image, write_image
+from rdstitch.io.read import read_image
+from rdstitch.io.write import write_image
 from rdstitch.results.pose import FollowedPoses, Pose
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.outputs import Outputs

@@ -27,7 +27,8 @@ from rdstitch.georeferencing.map_grid import MapGrid
 from rdstitch.georeferencing.place_on_map import AlignmentErrors, place_on_map
 from rdstitch.inputs.delays import MeasuredTilt
 from rdstitch.inputs.named_system import NamedSystem
-from rdstitch.io import ImageSpec, write_strips
+from rdstitch.io.strips import ImageSpec
+from rdstitch.io.write import write_strips
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.composition.map_canvas import plan_on_map

@@ -15,7 +15,7 @@ from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.find import find_images
 from rdstitch.inputs.frame import Frame, as_inputs
 from rdstitch.inputs.image_folders import natural_key
-from rdstitch.inputs.rosbag_images import _ENCODINGS, _eight_bits, _grey_of_compressed, _pixels
+from rdstitch.inputs.rosbag import _ENCODINGS, _eight_bits, _grey_of_compressed, _pixels
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import read_sources
 from rdstitch.io import video as video_reader

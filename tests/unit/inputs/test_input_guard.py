@@ -23,10 +23,11 @@ from rdstitch.inputs.frame import DeferredImage, Frame
 from rdstitch.inputs.frame_stream import open_frame_stream
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io import Metadata, write_image
 from rdstitch.io import read as reading
 from rdstitch.io.mask import Mask
+from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import DecodedImage, read_image
+from rdstitch.io.write import write_image
 from rdstitch.system.cache import Cache
 from tests.videos import write_video
 

@@ -20,9 +20,9 @@ from rdstitch.inputs.find import find_images
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.source import Source, read_sources
-from rdstitch.io import DecodedImage, read_image
-from rdstitch.io.mask import Mask, mask_frame, read_mask
+from rdstitch.io.mask import Mask, mask_frame
 from rdstitch.io.metadata import Metadata
+from rdstitch.io.read import DecodedImage, read_image
 from rdstitch.pipeline.registration.image_circle import with_image_circle
 from rdstitch.synthetic import FisheyeLens, grid_poses, ground, sequence_over
 from rdstitch.system.cache import Cache
@@ -62,12 +62,12 @@ def source(path: Path) -> Source:
 def test_a_mask_means_what_it_shows(tmp_path: Path, name: str, pixels: NDArray[np.uint8]) -> None:
     path = save(tmp_path / name, pixels)
     mask_frame(path, "image.png", SIZE)
-    mask = read_mask(path, SIZE)
+    mask = Mask(path).read(SIZE)
     assert mask.dtype == np.uint8
     np.testing.assert_array_equal(mask, np.where(leg(), 255, 0))
     # A black one leaves nothing, and a white one all.
     for value in (0, 1, 255):
-        mask = read_mask(save(tmp_path / "plain.png", np.full((30, 40), value, np.uint8)), SIZE)
+        mask = Mask(save(tmp_path / "plain.png", np.full((30, 40), value, np.uint8))).read(SIZE)
         assert (mask == (255 if value else 0)).all()
 
 
@@ -84,11 +84,11 @@ def test_what_a_camera_hides_turns_with_the_stored_image(tmp_path: Path, orienta
     path = save(tmp_path / "leg.png", leg().astype(np.uint8))
     expected = np.where(turned(leg(), orientation), 255, 0)
     frame = mask_frame(path, "image.png", upright, orientation, of_camera=True)
-    np.testing.assert_array_equal(read_mask(path, upright, frame), expected)
+    np.testing.assert_array_equal(Mask(path, frame).read(upright), expected)
     # The mask of one image is as that looks; of one for all only its shape can say that.
     shown = save(tmp_path / "shown.png", np.ascontiguousarray(turned(leg(), orientation)).astype(np.uint8))
     frame = mask_frame(shown, "image.png", upright, orientation)
-    np.testing.assert_array_equal(read_mask(shown, upright, frame), expected)
+    np.testing.assert_array_equal(Mask(shown, frame).read(upright), expected)
     if orientation in SIDEWAYS:
         assert mask_frame(shown, "image.png", upright, orientation, of_camera=True) is None
         assert mask_frame(path, "image.png", upright, orientation) == orientation

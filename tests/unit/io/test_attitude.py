@@ -11,8 +11,8 @@ from PIL.PngImagePlugin import PngInfo
 from examples.worlds.drone_xmp import DIALECTS, euler_angles, xmp_of
 from rdstitch.geometry.exif_orientation import turned, turning_matrix
 from rdstitch.geometry.planar_motion import tilt_from_normal
-from rdstitch.io import Attitude, Metadata, read_metadata
-from rdstitch.io.attitude import CONVENTIONS, read_attitude
+from rdstitch.io.attitude import CONVENTIONS, Attitude, read_attitude
+from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.synthetic import Poses
 
 DJI, PARROT, PIX4D = CONVENTIONS.values()

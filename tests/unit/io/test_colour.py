@@ -9,8 +9,8 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
-from rdstitch.io import read_image
 from rdstitch.io.colour import colour_space
+from rdstitch.io.read import read_image
 
 COLOURS = np.array([(200, 60, 60), (60, 200, 60), (40, 60, 200), (128, 128, 128), (250, 240, 200), (20, 25, 30)])
 PATCHES = np.repeat(np.repeat(COLOURS[None], 16, axis=0), 8, axis=1).astype(np.uint8)

@@ -9,8 +9,10 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from rdstitch.io import ImageSpec, Metadata, write_image, write_strips
 from rdstitch.io.deepzoom import read_deep_zoom
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.strips import ImageSpec
+from rdstitch.io.write import write_image, write_strips
 
 NAMESPACE = "{http://schemas.microsoft.com/deepzoom/2008}"
 

@@ -20,10 +20,11 @@ from PIL.PngImagePlugin import PngInfo
 from rdstitch.errors import InputError
 from rdstitch.inputs.find import find_images
 from rdstitch.io import read as reading
-from rdstitch.io import read_image, read_metadata, write_image
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
-from rdstitch.io.metadata import MAX_PROFILE
+from rdstitch.io.metadata import MAX_PROFILE, read_metadata
 from rdstitch.io.opening import MAX_IMAGE_GB
+from rdstitch.io.read import read_image
+from rdstitch.io.write import write_image
 from rdstitch.system.file_access import open_regular, read_beginning, read_limited, read_text
 
 _RGB = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
@@ -178,10 +179,9 @@ def test_raw_files(tmp_path: Path) -> None:
 def test_the_focal_length_of_a_raw_file_holds_for_its_image_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]
 ) -> None:
-    """Its tags count pixels of the sensor, however the camera was held."""
+    """Its tags count pixels of the sensor, however the camera was held; and of a camera without a name too."""
     tag = ExifTags.Base
     exif = Image.Exif()
-    exif[tag.Model] = "Camera"
     photo: dict[int, float] = {tag.FocalLength: 50.0, tag.FocalPlaneXResolution: 4000.0}
     exif.get_ifd(ExifTags.IFD.Exif).update(photo | {tag.ExifImageWidth: 6000, tag.ExifImageHeight: 4000})
     monkeypatch.setattr("rdstitch.io.metadata.raw_exif", lambda _: exif)

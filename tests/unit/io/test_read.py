@@ -15,10 +15,10 @@ from PIL import Image, PngImagePlugin
 
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
-from rdstitch.io import Metadata, read_image, read_metadata
 from rdstitch.io.attitude import CONVENTIONS
 from rdstitch.io.lens_correction import corrected
-from rdstitch.io.read import DecodedImage
+from rdstitch.io.metadata import Metadata, read_metadata
+from rdstitch.io.read import DecodedImage, read_image
 
 Samples = NDArray[Any]
 

@@ -10,7 +10,8 @@ import tifffile
 from numpy.typing import NDArray
 
 from rdstitch.geometry.exif_orientation import inverse, turned
-from rdstitch.io import read_image, read_metadata
+from rdstitch.io.metadata import read_metadata
+from rdstitch.io.read import read_image
 
 Samples = NDArray[Any]
 H, W = 20, 30

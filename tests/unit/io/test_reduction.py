@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rdstitch.features import FeatureOptions, View, detect, detect_view
-from rdstitch.io import Metadata, read_image, write_image
-from rdstitch.io.read import decoded_jpeg
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.read import decoded_jpeg, read_image
 from rdstitch.io.reduction import block_mean, halved, reduced_size
+from rdstitch.io.write import write_image
 from rdstitch.options.feature_options import CLOSER
 from rdstitch.synthetic import ground
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.frame import Frame
-from rdstitch.io import read_image, read_metadata
+from rdstitch.io.metadata import read_metadata
+from rdstitch.io.read import read_image
 from rdstitch.io.stored_tiles import stored_tiles
 from rdstitch.stage.tile_inputs import tile_frames, with_position_folders
 

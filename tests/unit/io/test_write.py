@@ -19,8 +19,11 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from rdstitch.errors import ArgumentError, LimitError, OutputError
-from rdstitch.io import ImageSpec, Metadata, read_image, write_image, write_strips
 from rdstitch.io.formats import FORMATS
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.read import read_image
+from rdstitch.io.strips import ImageSpec
+from rdstitch.io.write import write_image, write_strips
 from rdstitch.system.output_checks import WRITABLE_SUFFIXES
 
 Pixels = NDArray[Any]

@@ -17,7 +17,8 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography, from_directions, from_plane, to_directions, to_plane
 from rdstitch.inputs.frame import Frame
 from rdstitch.inputs.source import Source
-from rdstitch.io import DecodedImage, Metadata
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.read import DecodedImage
 from rdstitch.local_alignment import DisplacementField, LocalAlignment, PutativeMatches, align_locally, estimate, fit
 from rdstitch.local_alignment.estimate import _agreement_of_neighbours
 from rdstitch.local_alignment.field import grid_shape, node_points

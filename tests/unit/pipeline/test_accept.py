@@ -14,7 +14,7 @@ from rdstitch.arrays import FloatArray
 from rdstitch.choices import LensName, Purpose
 from rdstitch.features import Correspondences, FeatureOptions
 from rdstitch.geometry.camera import Camera
-from rdstitch.io import write_image
+from rdstitch.io.write import write_image
 from rdstitch.matching.feature_store import StoredMatches
 from rdstitch.matching.links import Link
 from rdstitch.matching.two_view import PairRegistration

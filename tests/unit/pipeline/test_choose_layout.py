@@ -14,7 +14,7 @@ from examples.worlds.trust_sets import judge_set, trust_set
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 from rdstitch.compositing import CompositeOptions, SeamBreak, SeamQuality
-from rdstitch.io import write_image
+from rdstitch.io.write import write_image
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.composition.choose_layout import _alternatives, _differs, _error, _Trials, choose_layout

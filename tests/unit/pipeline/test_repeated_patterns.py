@@ -16,7 +16,7 @@ from examples.worlds.compositing_scenes import render
 from rdstitch.arrays import FloatArray
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
-from rdstitch.io import write_image
+from rdstitch.io.write import write_image
 from rdstitch.pipeline.registration import register as stages
 from rdstitch.pipeline.registration import repeated_patterns
 from rdstitch.synthetic import ImageTexture, Photometry, RenderedSequence, grid_poses, ground, repeated, sequence_over

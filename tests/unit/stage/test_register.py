@@ -14,9 +14,9 @@ from examples.worlds.stage_grid import Specimen, StageGrid
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError, InputError
 from rdstitch.inputs.source import read_sources
-from rdstitch.io import write_image
 from rdstitch.io.flat_field import FlatField, read_flat_field
 from rdstitch.io.stored_tiles import stored_tiles
+from rdstitch.io.write import write_image
 from rdstitch.pipeline.composition.flat_field import with_flat_field
 from rdstitch.stage import SearchPlan, TileRegistration, register_tiles
 from rdstitch.stage.axes import with_measured_axes

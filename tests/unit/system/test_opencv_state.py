@@ -11,7 +11,7 @@ import cv2
 import pytest
 
 from rdstitch.io.video import opened_capture
-from rdstitch.system.opencv_state import one_opencv_thread, silent_opencv
+from rdstitch.system.native_threads import one_opencv_thread, silent_opencv
 
 LOGGING: Any = getattr(cv2.utils, "logging", cv2)
 THREADS = (one_opencv_thread, cv2.getNumThreads, cv2.setNumThreads, 1)
@@ -87,7 +87,7 @@ _BESIDE_A_THREAD_STARTED_MEANWHILE = """
 import sys, threading, time
 from concurrent.futures import ThreadPoolExecutor
 import cv2
-from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.native_threads import one_opencv_thread
 
 cv2.setNumThreads(4)
 done, pool = threading.Event(), ThreadPoolExecutor(1)
@@ -116,7 +116,7 @@ import cv2
 import numpy as np
 from rdstitch.features.detect import detect
 from rdstitch.io.video import opened_capture
-from rdstitch.system.opencv_state import one_opencv_thread
+from rdstitch.system.native_threads import one_opencv_thread
 
 image = np.random.default_rng(0).integers(0, 255, (400, 600), dtype=np.uint8)
 cv2.setNumThreads(4)
@@ -141,5 +141,5 @@ def test_a_forked_process_does_not_wait_for_the_threads_of_its_parent(threads: s
 
 
 def test_a_private_name_of_python_is_not_needed() -> None:
-    script = "import concurrent.futures.thread as t; del t._worker; import rdstitch.system.opencv_state"
+    script = "import concurrent.futures.thread as t; del t._worker; import rdstitch.system.native_threads"
     subprocess.run([sys.executable, "-c", script], timeout=60, check=True)

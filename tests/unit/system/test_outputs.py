@@ -25,7 +25,7 @@ from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
 from rdstitch.system.cache import Cache
 from rdstitch.system.file_access import content_state, is_url, url_of
-from rdstitch.system.output_checks import check_folder, check_output
+from rdstitch.system.output_checks import check_folder, check_outputs
 from rdstitch.system.outputs import Outputs, replace_folder, write_bytes_atomic
 from rdstitch.system.temporary_folder import TemporaryFolder
 from tests.faults import OPERATIONS, Operation, failing_disk
@@ -128,13 +128,13 @@ def test_a_link_stays_and_what_it_leads_to_is_replaced(tmp_path: Path, existing:
     link.symlink_to(target)
     if not existing:
         with pytest.raises(OutputError, match="link to nothing"):
-            check_output(link, overwrite=True)
+            check_outputs([link], overwrite=True)
         return
     target.write_bytes(b"old")
     target.chmod(0o640)
     with pytest.raises(OutputError, match="exists"):
-        check_output(link)
-    check_output(link, overwrite=True)
+        check_outputs([link], overwrite=False)
+    check_outputs([link], overwrite=True)
     write_bytes_atomic(link, b"new")
     assert link.is_symlink()
     assert (target.read_bytes(), target.stat().st_mode & 0o777) == (b"new", 0o640)
@@ -146,7 +146,7 @@ def test_a_folder_of_the_user_is_no_folder_of_tiles(tmp_path: Path) -> None:
     treasure.parent.mkdir(parents=True)
     treasure.write_bytes(b"dear")
     with pytest.raises(OutputError, match=r"photos_files: .*holds other files"):
-        check_output(tmp_path / "photos.dzi", overwrite=True)
+        check_outputs([tmp_path / "photos.dzi"], overwrite=True)
 
     def write() -> None:
         with Outputs(overwrite=True) as outputs:
@@ -166,12 +166,12 @@ def test_whatever_is_no_tile_keeps_a_folder(tmp_path: Path, name: str) -> None:
     (tmp_path / "a_files" / "0").mkdir(parents=True)
     (tmp_path / "a_files" / "0" / "0_0.jpg").write_bytes(b"tile")
     with pytest.raises(OutputError, match="a_files: exists already"):
-        check_output(tmp_path / "a.dzi")
-    check_output(tmp_path / "a.dzi", overwrite=True)
+        check_outputs([tmp_path / "a.dzi"], overwrite=False)
+    check_outputs([tmp_path / "a.dzi"], overwrite=True)
     (tmp_path / "a_files" / name).parent.mkdir(exist_ok=True)
     (tmp_path / "a_files" / name).write_bytes(b"dear")
     with pytest.raises(OutputError, match="holds other files"):
-        check_output(tmp_path / "a.dzi", overwrite=True)
+        check_outputs([tmp_path / "a.dzi"], overwrite=True)
 
 
 _KILLED = """
@@ -463,5 +463,5 @@ def test_what_is_read_by_a_url_of_this_machine_is_never_replaced(tmp_path: Path,
     image.write_bytes(b"the user's")
     for url in (f"{scheme}{image}", Path(f"{scheme}{image}")):
         with pytest.raises(OutputError, match="is read as input"):
-            check_output(image, True, [url])
-    check_output(image, True, ["memory://an image.png", "s3://bucket/a.png", "other.png"])
+            check_outputs([image], True, [url])
+    check_outputs([image], True, ["memory://an image.png", "s3://bucket/a.png", "other.png"])

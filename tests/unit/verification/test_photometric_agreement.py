@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from rdstitch.alignment.motion_models.rotation import rotation_from_vector
 from rdstitch.alignment.result import LinkFit
 from rdstitch.geometry.camera import Camera
-from rdstitch.io import DecodedImage, Metadata
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.read import DecodedImage
 from rdstitch.synthetic.textures import ground
 from rdstitch.verification import overlap_check
 from rdstitch.verification.overlap_check import CheckedLink, _least_confirmed, wrong_at_most

@@ -13,7 +13,8 @@ from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.inputs.source import Source
-from rdstitch.io import DecodedImage, Metadata
+from rdstitch.io.metadata import Metadata
+from rdstitch.io.read import DecodedImage
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.results.registration import Registration
 from rdstitch.synthetic.textures import ground

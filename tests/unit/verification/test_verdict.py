@@ -12,7 +12,7 @@ from rdstitch.alignment.result import LinkFit
 from rdstitch.choices import Purpose
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
-from rdstitch.io import write_image
+from rdstitch.io.write import write_image
 from rdstitch.matching.mixed_lenses import TwoLenses
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import pano
