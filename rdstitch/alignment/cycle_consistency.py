@@ -171,8 +171,7 @@ def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArr
     typical = observations.medians(np.sqrt(squared))
     usual = _weighted_median(typical, np.where(np.isfinite(typical), observations.matches, 0))
     tolerance = _MIN_ERROR * np.sqrt(observations.scale1 * observations.scale2)
-    outlying: BoolArray = ~(typical <= np.maximum(_OUTLYING * usual, tolerance))
-    return outlying
+    return ~(typical <= np.maximum(_OUTLYING * usual, tolerance))
 
 
 def _weighted_median(values: FloatArray, weights: IntArray) -> float:

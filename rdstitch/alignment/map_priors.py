@@ -127,8 +127,7 @@ class _Positions(_KnownPlaces):
         self.labels, self.item = np.flatnonzero(self.known).tolist(), np.arange(len(self.metres))
 
     def estimated(self, fit: Fit) -> ComplexArray:
-        places: ComplexArray = fit.result.parameters.poses[self.known][:, [X, Y]] @ _COMPLEX
-        return places
+        return np.asarray(fit.result.parameters.poses[self.known][:, [X, Y]] @ _COMPLEX)
 
     def prior(self, priors: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
         places, weights = np.zeros((len(self.known), 2)), np.zeros(len(self.known))
@@ -163,8 +162,7 @@ class _Control(_KnownPlaces):
     def estimated(self, fit: Fit) -> ComplexArray:
         sums = np.zeros((len(self.metres), 2))
         np.add.at(sums, self.points.point, _sightings(self.points, fit))
-        means: ComplexArray = (sums / self.count[:, None]) @ _COMPLEX
-        return means
+        return np.asarray((sums / self.count[:, None]) @ _COMPLEX)
 
     def prior(self, priors: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
         shown = self.points

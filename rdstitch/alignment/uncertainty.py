@@ -154,8 +154,7 @@ def _by_images(observations: Observations, influence: FloatArray) -> FloatArray:
     np.add.at(link, observations.link, influence)
     for images in (observations.image1, observations.image2):
         np.add.at(image, images, link)
-    covariance: FloatArray = image.T @ image - link.T @ link
-    return covariance
+    return image.T @ image - link.T @ link
 
 
 def considered_covariance(problem: Problem, fit: Fit, covariance: FloatArray, *, over_relief: bool) -> FloatArray:
@@ -191,8 +190,7 @@ def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, ove
     of_free = 1.0 / (1.0 + math.exp(against))
     off = free.result.parameters.lens - fit.result.parameters.lens
     other = considered_covariance(problem, free, covariances(problem, free)[1], over_relief=over_relief)
-    mixed: FloatArray = (1.0 - of_free) * covariance + of_free * (other + np.outer(off, off))
-    return mixed
+    return (1.0 - of_free) * covariance + of_free * (other + np.outer(off, off))
 
 
 def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:

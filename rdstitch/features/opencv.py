@@ -135,8 +135,7 @@ def to_rootsift(descriptors: Descriptors) -> NDArray[np.float32]:
     """
     values = descriptors.astype(np.float32)
     total = np.maximum(values.sum(axis=1, keepdims=True), np.float32(1.0))
-    rooted: NDArray[np.float32] = np.rint(np.sqrt(values / total) * np.float32(_ROOTSIFT_NORM))
-    return rooted
+    return np.asarray(np.rint(np.sqrt(values / total) * np.float32(_ROOTSIFT_NORM)))
 
 
 def _strength(response: FloatArray, size: FloatArray, *, of_sift: bool) -> FloatArray:

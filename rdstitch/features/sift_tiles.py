@@ -97,8 +97,7 @@ class _Interval:
     def owns(self, places: FloatArray) -> NDArray[np.bool_]:
         """Test that places, pixels of the tile, are in the part that it keeps."""
         places = places + self.seen.start
-        inside: NDArray[np.bool_] = (places >= self.start) & (places < self.stop)
-        return inside
+        return (places >= self.start) & (places < self.stop)
 
 
 def _intervals(length: int) -> list[_Interval]:

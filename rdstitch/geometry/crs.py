@@ -248,8 +248,7 @@ def _latitude(conformal: FloatArray) -> FloatArray:
     """Latitudes of conformal ones, radians."""
     n = _THIRD_FLATTENING
     series = (2 * n - 2 * n**2 / 3 - 2 * n**3, 7 * n**2 / 3 - 8 * n**3 / 5, 56 * n**3 / 15)
-    phi: FloatArray = conformal + sum(factor * np.sin(2 * k * conformal) for k, factor in enumerate(series, start=1))
-    return phi
+    return conformal + sum(factor * np.sin(2 * k * conformal) for k, factor in enumerate(series, start=1))
 
 
 def _central_meridian(zone: int) -> float:

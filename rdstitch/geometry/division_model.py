@@ -45,14 +45,12 @@ _NEAREST_TOLERANCE = 1e-13
 def divisor(radius2: FloatArray, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
     """``g`` at squared radii of measured points; λ broadcasts, ``higher`` are μ and ν."""
     tail = horner(higher, radius2)
-    result: FloatArray = 1.0 + (np.asarray(distortion) + tail) * radius2
-    return result
+    return 1.0 + (np.asarray(distortion) + tail) * radius2
 
 
 def divisor_slope(radius2: FloatArray, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
     """Derivative of ``g`` by the squared radius: ``λ + 2 μ q + 3 ν q²``."""
-    result: FloatArray = np.asarray(distortion) + horner([(k + 2) * c for k, c in enumerate(higher)], radius2)
-    return result
+    return np.asarray(distortion) + horner([(k + 2) * c for k, c in enumerate(higher)], radius2)
 
 
 def undistort(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:

@@ -24,8 +24,7 @@ def nearest_rotation(matrices: FloatArray) -> FloatArray:
     """Rotations (..., 3, 3) nearest to matrices, up to a positive scale (orthogonal Procrustes, Kabsch)."""
     left, _, right = np.linalg.svd(matrices)
     left[..., 2] *= np.sign(np.linalg.det(left @ right))[..., None]
-    rotation: FloatArray = left @ right
-    return rotation
+    return np.asarray(left @ right)
 
 
 def rotation_about(vectors: FloatArray, angles: FloatArray) -> FloatArray:
@@ -33,8 +32,7 @@ def rotation_about(vectors: FloatArray, angles: FloatArray) -> FloatArray:
     cross = np.einsum("nk,kij->nij", vectors, np.stack([ABOUT_X, ABOUT_Y, ABOUT_Z]))
     first = np.sinc(angles / np.pi)[:, None, None]
     second = 0.5 * np.sinc(angles / (2.0 * np.pi))[:, None, None] ** 2
-    rotation: FloatArray = np.eye(3) + first * cross + second * (cross @ cross)
-    return rotation
+    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
 
 
 def rotation_from_tilt(tilt: ArrayLike) -> FloatArray:

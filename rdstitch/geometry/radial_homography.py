@@ -74,8 +74,7 @@ def to_directions(camera: Camera, matrix: FloatArray, points: ArrayLike) -> Floa
     ``matrix`` (3, 3) leads from undistorted normalized coordinates to directions.
     """
     flat = camera.normalize(camera.undistort(points))
-    directions: FloatArray = np.concatenate([flat, np.ones((len(flat), 1))], axis=1) @ matrix.T
-    return directions
+    return np.concatenate([flat, np.ones((len(flat), 1))], axis=1) @ matrix.T
 
 
 def from_directions(camera: Camera, matrix: FloatArray, directions: FloatArray) -> FloatArray:

@@ -167,8 +167,7 @@ def _agreeing(
     tolerance = np.minimum(_NEAR + _SPREAD * np.abs(expected - z2[index]), _FAR)
     relative = np.log(motion / motion[index])
     near = np.abs(expected - z2) < tolerance
-    agreeing: BoolArray = near & (np.abs(relative.real) < _LOG_SCALE) & (np.abs(relative.imag) < _TURN)
-    return agreeing
+    return np.asarray(near & (np.abs(relative.real) < _LOG_SCALE) & (np.abs(relative.imag) < _TURN))
 
 
 def _refined(

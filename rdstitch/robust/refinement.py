@@ -98,8 +98,7 @@ class PairProblems:
             return before.cost
         prior = (after.noise**2 - before.noise**2) * before.prior
         change, unchanged = (robust_cost(before.squared, each.scale[:, None]) for each in (after, before))
-        result: FloatArray = before.cost + prior + ((change - unchanged) * self.data.present).sum(axis=1)
-        return result
+        return np.asarray(before.cost + prior + ((change - unchanged) * self.data.present).sum(axis=1))
 
     def jacobian(self, parameters: FloatArray) -> FloatArray:
         """Derivative of the entries of H and the lens by the lens and the model's parameters, (B, 9 + E, E + P)."""

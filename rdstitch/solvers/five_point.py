@@ -81,5 +81,4 @@ class DirectionEquation(SampleArrays):
         alpha, beta, gamma = constant + slope * distortion
         a1, a2, a3 = alpha
         first, second, third = beta * gamma
-        value: FloatArray = first * (a2 * a3) + second * (a3 * a1) + third * (a1 * a2)
-        return value
+        return np.asarray(first * (a2 * a3) + second * (a3 * a1) + third * (a1 * a2))

@@ -116,8 +116,7 @@ def plane_points(points: FloatArray, rotations: TiltRotations, distortion: Float
     x, y = points
     r = rotations.matrices
     seen = r[0] * x + r[1] * y + r[2] * (1.0 + distortion * squared_radii(points))
-    plane: FloatArray = seen[:2] / seen[2]
-    return plane
+    return np.asarray(seen[:2] / seen[2])
 
 
 def motion_homography(

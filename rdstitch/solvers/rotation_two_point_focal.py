@@ -79,5 +79,4 @@ class _AngleEquation(SampleArrays):
         """The equation itself."""
         dot = [(1.0 - t) * self.dot[k, 0] + t * self.product[k, 0] for k in (0, 1)]
         cross = [(1.0 - t) * self.cross[k, 0] + t * self.length[k, 0] for k in (0, 1)]
-        value: FloatArray = dot[0] * dot[0] * cross[1] - dot[1] * dot[1] * cross[0]
-        return value
+        return np.asarray(dot[0] * dot[0] * cross[1] - dot[1] * dot[1] * cross[0])

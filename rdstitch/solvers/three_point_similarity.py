@@ -91,5 +91,4 @@ class DistanceRatioEquation(SampleArrays):
         m13, m12 = x * x + y * y
         w2, w3 = linear[4:]
         w, v = w3[0] * w2[1], w3[1] * w2[0]
-        value: FloatArray = m12[0] * m13[1] * (w * w) - m12[1] * m13[0] * (v * v)
-        return value
+        return np.asarray(m12[0] * m13[1] * (w * w) - m12[1] * m13[0] * (v * v))

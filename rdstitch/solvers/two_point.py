@@ -80,5 +80,4 @@ class DistanceEquation(SampleArrays):
         constant, slope = self.linear[:, :, :, None] if distortion.ndim > 1 else self.linear
         mx, my, w1, w2 = constant + slope * distortion
         length, (w, v) = mx * mx + my * my, w1 * w2
-        value: FloatArray = length[0] * (v * v) - length[1] * (w * w)
-        return value
+        return np.asarray(length[0] * (v * v) - length[1] * (w * w))

@@ -62,8 +62,7 @@ class Upright:
         basis = np.column_stack([*self.axes, np.cross(*self.axes)])
         if turned:
             basis = nearest_rotation(basis)
-        matrix: FloatArray = np.linalg.inv(basis) @ to_axes(frame, self.focal.value)
-        return matrix
+        return np.linalg.inv(basis) @ to_axes(frame, self.focal.value)
 
 
 def to_axes(frame: FloatArray, focal: float) -> FloatArray:
@@ -145,8 +144,7 @@ class Edges:
 
     def normals(self, focal: float) -> FloatArray:
         """Normals (N, 3) of the planes through the edges and the camera."""
-        normals: FloatArray = self.lines * (focal, focal, 1.0)
-        return normals
+        return self.lines * (focal, focal, 1.0)
 
     def distances(self, directions: FloatArray, focal: float) -> tuple[FloatArray, FloatArray]:
         """Distances (..., N) from middles to vanishing points of directions (..., N or 1, 3), and their gradients."""
@@ -193,8 +191,7 @@ def of_edges(edges: Edges, axis: IntArray, start: FloatArray, focal: Focal, firs
 def rotation(vector: ArrayLike) -> FloatArray:
     """Rotation (3, 3) about an axis (3,), by its length in radians."""
     about = np.atleast_2d(np.asarray(vector, dtype=np.float64))
-    matrix: FloatArray = rotation_about(about, np.linalg.norm(about, axis=1))[0]
-    return matrix
+    return np.asarray(rotation_about(about, np.linalg.norm(about, axis=1))[0])
 
 
 def nearest_axis(edges: Edges, axes: FloatArray, focal: float) -> IntArray:
@@ -267,5 +264,4 @@ def _best_axes(edges: Edges, start: FloatArray, focal: float, *, depth: bool) ->
 def _along(directions: FloatArray, wanted: FloatArray) -> FloatArray:
     """Directions (N, 3) with length 1 and the sign by which they are nearer to ``wanted``."""
     length = np.linalg.norm(directions, axis=1, keepdims=True)
-    unit: FloatArray = directions / np.maximum(length, 1e-12) * np.where(directions @ wanted < 0.0, -1.0, 1.0)[:, None]
-    return unit
+    return np.asarray(directions / np.maximum(length, 1e-12) * np.where(directions @ wanted < 0.0, -1.0, 1.0)[:, None])

@@ -92,8 +92,7 @@ class PlaneMarks:
     def places(self, matrices: FloatArray, lens: FloatArray, focal: float) -> FloatArray:
         """Where images with plane-to-image matrices (N, 3, 3) put the marks, (M, 2)."""
         lifted = self._lifted(matrices, lens)[0]
-        places: FloatArray = focal * lifted[:, :2] / lifted[:, 2:]
-        return places
+        return focal * lifted[:, :2] / lifted[:, 2:]
 
     def cost(self, matrices: FloatArray, lens: FloatArray, focal: float) -> float:
         """Squared errors over their variances."""
