@@ -11,7 +11,6 @@ The state of the planar models is
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -30,36 +29,6 @@ from rdstitch.robust.priors import Prior, prior_costs, prior_slopes
 _TILTS, _YAW, _TX, _TY, _HEIGHT, _FOCAL = slice(0, 4), 4, 5, 6, 7, 8
 _PSI, _THETA = (0, 2), (1, 3)
 _COMPLEMENT = np.eye(9)[:, 1:]
-
-
-class PairModel(Protocol):
-    """A parametrisation of the homographies between two images, in the half-diagonal frame, of B pairs at once."""
-
-    @property
-    def name(self) -> str:
-        """Name of the model in the family."""
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the P entries of a step."""
-
-    def initialize(self, homography: FloatArray, tilts: FloatArray | None = None) -> FloatArray:
-        """States (B, 9) nearest to homographies (B, 3, 3), for known tilts (B, 2, 2), radians."""
-
-    def homography(self, state: FloatArray) -> FloatArray:
-        """Homographies (B, 3, 3)."""
-
-    def jacobian(self, state: FloatArray) -> FloatArray:
-        """Derivatives of the homographies by a step, shape (B, 9, P)."""
-
-    def retract(self, state: FloatArray, step: FloatArray) -> FloatArray:
-        """States (B, 9) after steps (B, P)."""
-
-    def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Cost (B,) of the states by a prior, and its slope and curvature by a step (B, P)."""
-
-    def motion(self, state: FloatArray) -> PlanarMotion | None:
-        """The planar motion of one state (9,), if the model is one."""
 
 
 @dataclass(frozen=True)
@@ -213,3 +182,6 @@ class PlanarPairModel:
 
 
 _IN_PLANE = np.array([1.0, 1.0, 0.0])
+
+PairModel = HomographyPairModel | PlanarPairModel
+"""A parametrisation of the homographies of B pairs at once, in the half-diagonal frame."""

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -17,10 +18,11 @@ from rdstitch.numerics.robust_loss import (
     robust_weight,
     sigma_of,
 )
-from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations, _damped_step, damping_by_gain, descend
+from rdstitch.robust.levenberg_marquardt import damped_step, damping_by_gain
 from rdstitch.robust.model_selection import rms_of
 from rdstitch.robust.posterior import Evidence
 from rdstitch.robust.priors import LENS_PRIORS, TILT_PRIOR, Prior, exact, focal_prior
+from rdstitch.robust.refinement import PairEquations, descend
 from rdstitch.robust.similarity_fit import fit_similarity
 from tests.alignment_stubs import SCALE, independent_errors, observations
 
@@ -68,17 +70,9 @@ def test_the_rms_is_that_of_the_inliers() -> None:
     assert np.isnan(found[1])
 
 
-class _ValleyEquations(BatchedNormalEquations):
-    """Noise of a hundredth of the loss at the bottom."""
-
-    @property
-    def unit(self) -> FloatArray:
-        return np.full(len(self.cost), 1e-4)
-
-
 @dataclass(frozen=True)
 class _Valleys:
-    """Losses ``floor + (x² - 1)²`` of one parameter, and how often each was evaluated."""
+    """Losses ``floor + (x² - 1)²`` of one parameter with noise of 0.01, and how often each was evaluated."""
 
     floor: FloatArray
     number: IntArray
@@ -87,14 +81,15 @@ class _Valleys:
     def take(self, rows: BoolArray | IntArray) -> "_Valleys":
         return _Valleys(self.floor[rows], self.number[rows], self.evaluations)
 
-    def normal_equations(self, parameters: FloatArray) -> _ValleyEquations:
+    def normal_equations(self, parameters: FloatArray) -> PairEquations:
         self.evaluations[self.number] += 1
         x = parameters[:, 0]
         residual, slope = x**2 - 1.0, 2.0 * x
         cost, information, gradient = self.floor + residual**2, (slope**2)[:, None, None], (slope * residual)[:, None]
-        return _ValleyEquations(cost, information, gradient, (residual**2)[:, None])
+        none, noise = np.zeros(len(x)), np.full(len(x), 0.01)
+        return PairEquations(cost, information, gradient, (residual**2)[:, None], none, noise, none, cast(Any, none))
 
-    def cost(self, before: _ValleyEquations, after: _ValleyEquations) -> FloatArray:
+    def cost(self, before: PairEquations, after: PairEquations) -> FloatArray:
         return before.cost
 
     def retract(self, parameters: FloatArray, step: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -105,16 +100,16 @@ def test_descents_in_lockstep_do_not_notice_each_other() -> None:
     """One that starts farther off goes on when the other has converged."""
     counted = np.zeros(2, dtype=np.intp)
     start = np.array([[1.5], [30.0]])
-    found, equations = descend(_Valleys(np.zeros(2), np.arange(2), counted), start, 30)
+    found, equations = descend(cast(Any, _Valleys(np.zeros(2), np.arange(2), counted)), start, 30)
     np.testing.assert_allclose(found, 1.0, atol=1e-2)
-    alone, _ = descend(_Valleys(np.zeros(1), np.arange(1), np.zeros(1, dtype=np.intp)), start[:1], 30)
+    alone, _ = descend(cast(Any, _Valleys(np.zeros(1), np.arange(1), np.zeros(1, dtype=np.intp))), start[:1], 30)
     assert found[0, 0] == alone[0, 0]
     np.testing.assert_array_equal(equations.squared, (found**2 - 1.0) ** 2)
     assert counted[0] < counted[1]
 
 
 def test_what_is_only_a_start_takes_fewer_steps() -> None:
-    valley = _Valleys(np.ones(1), np.arange(1), np.zeros(1, dtype=np.intp))
+    valley: Any = _Valleys(np.ones(1), np.arange(1), np.zeros(1, dtype=np.intp))
     start = np.full((1, 1), 1.003)
     assert descend(valley, start, 30, loose=True)[0] == start
     assert abs(descend(valley, start, 30)[0] - 1.0) < 1e-3
@@ -273,7 +268,7 @@ def test_a_singular_problem_leaves_the_others_as_if_they_were_alone() -> None:
     damping = np.full(2, 1e-4)
     singular = 1.0 + (damping[0] + 1e-12)
     information = np.array([[[2.0, 1.0], [1.0, 3.0]], [[1.0, singular], [singular, 1.0]]])
-    equations = BatchedNormalEquations(np.ones(2), information, np.array([[0.3, -0.7], [1.0, 1.0]]), np.ones((2, 1)))
-    together, alone = _damped_step(equations, damping), _damped_step(equations.take(np.arange(1)), damping[:1])
+    gradient = np.array([[0.3, -0.7], [1.0, 1.0]])
+    together, alone = (damped_step(information[:k], gradient[:k], damping[:k]) for k in (2, 1))
     assert together[0].tobytes() == alone[0].tobytes()
     assert np.isnan(together[1]).all()
