@@ -76,7 +76,11 @@ class Crs:
 
     @property
     def _zone(self) -> int:
-        return _zone_of_epsg(self.epsg)
+        """The zone that the code stands for; 0 of other systems."""
+        for first, sign in ((_NORTH, 1), (_SOUTH, -1)):
+            if 1 <= self.epsg - first <= _POLAR:
+                return sign * (self.epsg - first)
+        return 0
 
     @classmethod
     def in_metres(cls, epsg: int) -> "Crs | None":
@@ -188,14 +192,6 @@ def _zone_at(latitude: float, longitude: float) -> int:
 def epsg_of(zone: int) -> int:
     """EPSG code of a zone."""
     return (_NORTH if zone > 0 else _SOUTH) + abs(zone)
-
-
-def _zone_of_epsg(epsg: int) -> int:
-    """The zone that a code stands for; 0 of other systems."""
-    for first, sign in ((_NORTH, 1), (_SOUTH, -1)):
-        if 1 <= epsg - first <= _POLAR:
-            return sign * (epsg - first)
-    return 0
 
 
 def _utm(latitude: ArrayLike, longitude: ArrayLike, zone: int) -> FloatArray:

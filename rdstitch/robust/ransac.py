@@ -21,8 +21,8 @@ from rdstitch.solvers.solutions import Solutions
 
 # Halved or doubled, none of these changes what is found, only the time.
 _FIRST_BATCH = 48  # samples of the first round; every round has twice as many as the one before
-_MAX_BATCH = 512  # samples of a round at the most
-_ALONE = 512  # samples up to which the solver that assumes least goes on alone if it needs no more
+# samples of a round at the most, and of the solver that assumes least up to which it goes on alone if it needs no more
+_MAX_BATCH = 512
 _SAMPLES_AT_ONCE = 4096
 _MIN_EXPLORATION = 96  # samples that every solver draws unless its own confidence is reached before
 _QUICK_SCORE = 128  # matches on which hypotheses are compared before the best are scored on all
@@ -114,7 +114,7 @@ def ransac(
         sure = (drawn[-1] >= needed[-1]) | (explored & (drawn >= needed).any(axis=0))
         confident[active[sure]] = True
         going = ~sure & (drawn.sum(axis=0) < options.max_iterations)
-        active, hard = active[going], active[going & (needed[-1] > _ALONE)]
+        active, hard = active[going], active[going & (needed[-1] > _MAX_BATCH)]
         batch = min(2 * batch, _MAX_BATCH)
     return Search(best, np.sum([one.drawn for one in states], axis=0), confident)
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError
@@ -182,16 +181,10 @@ def of_edges(edges: Edges, axis: IntArray, start: FloatArray, focal: Focal, firs
         jacobian = np.vstack([jacobian, [0.0, 0.0, 0.0, prior]])
         residual = np.append(off / edges.error, prior * (log_focal - math.log(focal.value)))
         step = np.linalg.lstsq(jacobian, -residual, rcond=1e-9)[0]
-        axes, log_focal = axes @ rotation(step[:3]).T, log_focal + float(np.clip(step[3], -0.3, 0.3))
+        axes, log_focal = axes @ rotation_about(step[:3]).T, log_focal + float(np.clip(step[3], -0.3, 0.3))
         if np.abs(step).max() < 1e-12:
             break
     return Upright(axes[:2], Focal(math.exp(log_focal), focal.log_std))
-
-
-def rotation(vector: ArrayLike) -> FloatArray:
-    """Rotation (3, 3) about an axis (3,), by its length in radians."""
-    about = np.atleast_2d(np.asarray(vector, dtype=np.float64))
-    return np.asarray(rotation_about(about, np.linalg.norm(about, axis=1))[0])
 
 
 def nearest_axis(edges: Edges, axes: FloatArray, focal: float) -> IntArray:
