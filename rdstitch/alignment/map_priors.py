@@ -53,10 +53,6 @@ class MapFit:
     disagreement: Message | None = None
     leverage: Mapping[int | str, float] = field(default_factory=dict)  # by image of the problem, and name of a point
 
-    def leverage_of(self, images: IntArray) -> dict[int | str, float]:
-        """The leverage by the numbers that images of the problem have among all images (N,)."""
-        return {key if isinstance(key, str) else int(images[key]): value for key, value in self.leverage.items()}
-
 
 def adjust_to_map(problem: Problem, fit: Fit) -> MapFit:
     """Adjust again with positions and control points as priors, where there are enough of them, and they agree."""

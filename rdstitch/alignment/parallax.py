@@ -88,15 +88,10 @@ class Parallax:
         poses = model.metric_poses(parameters.poses, parameters.shared)
         return poses[:, [X, Y]], np.exp(poses[:, LOG_HEIGHT])
 
-    @cached_property
-    def _shifts(self) -> FloatArray:
-        """Shifts (N, 2) of the camera away from where it turns, one an image: any, since nothing is known of them."""
-        return np.random.default_rng(0).normal(size=(len(self._back), 2))
-
     def _moved(self, place: FloatArray, images: IntArray) -> FloatArray:
         """Motion (m, 2) of measured points of places in their images (m,) with the height of the ground."""
-        if self.is_turn:
-            return self._shifts[images]
+        if self.is_turn:  # any shift of the camera away from where it turns, one an image: nothing is known of them
+            return np.random.default_rng(0).normal(size=(len(self._back), 2))[images]
         lens, matrices = self.result.parameters.lens, self.result.matrices.matrices[images]
         distortion, higher, _ = split_lens(lens)
         nadirs, heights = self._nadirs

@@ -108,7 +108,10 @@ def _lens_and_model(given: GivenImages, known: KnownModel | None = None) -> Adju
     distortion = float(lens.pairwise.parameters.lens[0])
     priors = priors.with_lens(distortion)
     wrong, confirmed = cycle_consistency(lens.pairwise, sample, len(given.cameras))
-    all_links = _problem_of_all_links(given, known, sample, lens, _tree_ranks(sample, confirmed), priors, wrong)
+    # A tree of the links with a consistent triangle first, by their matches. Where all have as many, one of the first
+    # links might pass over neighbours, and join them a whole path away: the area of the matches decides.
+    ranks = np.argsort(np.lexsort((sample.areas, sample.matches, confirmed > 0))).astype(np.float64)
+    all_links = _problem_of_all_links(given, known, sample, lens, ranks, priors, wrong)
     connected, images = all_links.part(~wrong)
     # Data weigh against priors as they will in the final adjustment.
     shared, _ = independent_errors(connected.observations, connected.homographies, connected.lens)
@@ -186,7 +189,9 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
         choice=replace(choice, fit=fit),
         lens=chosen.lens.refined(problem.free_lens),
         messages=(*filter(None, [on_map.disagreement]), *chosen.messages),
-        leverage=on_map.leverage_of(chosen.images),
+        leverage={
+            key if isinstance(key, str) else int(chosen.images[key]): one for key, one in on_map.leverage.items()
+        },
         covariance=covariance,
         lens_covariance=of_lens,
     )
@@ -256,15 +261,6 @@ def _check(given: GivenImages) -> None:
         raise ArgumentError(f"the reference image {options.reference} is not among the {len(cameras)}")
     if options.lens_known and len({camera.coefficients for camera in cameras}) > 1:
         raise ArgumentError("the images have lenses that differ: those of one lens are aligned at a time")
-
-
-def _tree_ranks(observations: Observations, confirmed: IntArray) -> FloatArray:
-    """Ranks of the links for the spanning tree: those with a consistent triangle first, by their matches, and by the
-    area of these where they are as many.
-
-    Where all are as many, a tree of the first links may pass over neighbours, and join them a whole path away.
-    """
-    return np.argsort(np.lexsort((observations.areas, observations.matches, confirmed > 0))).astype(np.float64)
 
 
 def _drop_wrong_pairs(

@@ -152,6 +152,3 @@ class Correspondences(Rows):
     def of(cls, features1: Features, features2: Features, indices: NDArray[np.intp], ratio: FloatArray) -> Self:
         """Correspondences between the features of two images."""
         return cls(indices, features1.points[indices[:, 0]], features2.points[indices[:, 1]], ratio)
-
-    def __len__(self) -> int:
-        return len(self.ratio)

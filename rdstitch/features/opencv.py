@@ -1,6 +1,6 @@
 """The detectors that OpenCV brings, in the steps that all detectors take: find, choose, describe."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from operator import attrgetter
 from typing import Any, cast
 
@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.choices import FeatureName
 from rdstitch.errors import ArgumentError
 from rdstitch.features.keypoints import Descriptors, Detection, Features
 from rdstitch.options.feature_options import FeatureOptions
@@ -97,35 +96,19 @@ def _table(keypoints: Sequence[cv2.KeyPoint], *names: str) -> FloatArray:
 def create_detector(options: FeatureOptions) -> Any:
     """Make the OpenCV detector of a kind of features."""
     try:
-        return _CREATORS[options.kind](options)
+        if options.kind == "orb":
+            # Many more than wanted, because ORB keeps the strongest of the whole image and we spread them.
+            return cv2.ORB.create(nfeatures=8 * options.limits[0], fastThreshold=_ORB_FAST_THRESHOLD)
+        if options.kind == "akaze":
+            # OpenCV 5 moved it to xfeatures2d.
+            namespace: Any = cv2 if hasattr(cv2, "AKAZE_create") else cv2.xfeatures2d
+            return namespace.AKAZE_create(threshold=_AKAZE_THRESHOLD)
+        # Without the precise upscale all points are a quarter of a pixel off.
+        return cv2.SIFT.create(nfeatures=0, contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
     except (AttributeError, cv2.error) as error:
         raise ArgumentError(
             f"features {options.kind!r} are not in this OpenCV ({cv2.__version__}); choose others"
         ) from error
-
-
-def _sift(options: FeatureOptions) -> Any:
-    # Without the precise upscale all points are a quarter of a pixel off.
-    return cv2.SIFT.create(nfeatures=0, contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
-
-
-def _orb(options: FeatureOptions) -> Any:
-    # Many more than wanted, because ORB keeps the strongest of the whole image and we spread them.
-    return cv2.ORB.create(nfeatures=8 * options.limits[0], fastThreshold=_ORB_FAST_THRESHOLD)
-
-
-def _akaze(options: FeatureOptions) -> Any:
-    # OpenCV 5 moved it to xfeatures2d.
-    namespace: Any = cv2 if hasattr(cv2, "AKAZE_create") else cv2.xfeatures2d
-    return namespace.AKAZE_create(threshold=_AKAZE_THRESHOLD)
-
-
-_CREATORS: dict[FeatureName, Callable[[FeatureOptions], Any]] = {
-    "sift": _sift,
-    "rootsift": _sift,
-    "orb": _orb,
-    "akaze": _akaze,
-}
 
 
 def to_rootsift(descriptors: Descriptors) -> NDArray[np.float32]:

@@ -113,7 +113,7 @@ def match_pattern(features1: Features, features2: Features) -> Correspondences:
         return nothing
     half = float(np.hypot(*(features1.image_size or np.ptp(features1.points, axis=0)))) / 2.0
     keypoint, partner, distance = _partners(features1, features2)
-    z1, z2 = (_complex(f.points)[index] / half for f, index in ((features1, keypoint), (features2, partner)))
+    z1, z2 = (f.points[of] @ np.array([1.0, 1.0j]) / half for f, of in ((features1, keypoint), (features2, partner)))
     turn = features2.angle[partner] - features1.angle[keypoint]
     motion = features2.scale[partner] / features1.scale[keypoint] * np.exp(1j * turn)
     likely = np.argsort(distance, kind="stable")[: len(distance) // 2]
@@ -153,10 +153,6 @@ def _partners(features1: Features, features2: Features) -> tuple[IntArray, IntAr
     scale = np.abs(np.log(features2.scale[partner] / features1.scale[keypoint]))
     kept = scale < np.log(_MAX_SCALE)
     return keypoint[kept], partner[kept], distance[kept]
-
-
-def _complex(points: FloatArray) -> NDArray[np.complex128]:
-    return np.asarray(points[:, 0] + 1j * points[:, 1], dtype=np.complex128)
 
 
 def _agreeing(

@@ -86,7 +86,10 @@ class ModelSelection:
         rms = np.stack([rms_of(each.equations.errors, self.threshold) for each in fitted], axis=1)
 
         def finished(index: int, rows: IntArray, why: str) -> dict[int, PairFit]:
-            reasons = [_explained(fitted, index, rms[k], why) for k in rows]
+            errors = (
+                ", ".join(f"{one.name} {e:.2f} pixels" for one, e in zip(fitted, rms[k], strict=True)) for k in rows
+            )
+            reasons = [f"{fitted[index].name}: {why} (rms {listed})" for listed in errors]
             selected, parameters = fitted[index].start(pairs).take(rows), fitted[index].parameters[rows]
             # On all matches, with the noise that it leaves itself.
             problems = self._problems(fitted[index].problems.model, selected)
@@ -149,9 +152,3 @@ def rms_of(errors: FloatArray, threshold: float) -> FloatArray:
     count = inside.sum(axis=1)
     total = np.square(np.where(inside, errors, 0.0)).sum(axis=1)
     return np.asarray(np.sqrt(np.where(count > 0, total, np.nan) / np.maximum(count, 1)))
-
-
-def _explained(fitted: list[_Fitted], chosen: int, rms: FloatArray, why: str) -> str:
-    """Which model was chosen and why, with the errors that each leaves."""
-    listed = ", ".join(f"{one.name} {value:.2f} pixels" for one, value in zip(fitted, rms, strict=True))
-    return f"{fitted[chosen].name}: {why} (rms {listed})"

@@ -62,9 +62,6 @@ class Blobs(Rows):
     # (N,), int8: sign of the trace of the Hessian: +1 for dark blobs, -1 for light ones
     laplacian_sign: NDArray[np.int8]
 
-    def __len__(self) -> int:
-        return len(self.points)
-
     @property
     def scale(self) -> FloatArray:
         """The s of the paper, pixels, shape (N,)."""
