@@ -125,10 +125,7 @@ def _open_triangles(pairwise: BundleAdjustmentResult, observations: Observations
 
 
 def _usual_misclosure(misclosure: FloatArray, corners: IntArray, observations: Observations) -> float:
-    """The lower quartile of the triangles (T,) with a link, as half of the matches have it.
-
-    Not that of all triangles: each wrong link between images far apart opens many.
-    """
+    """The lower quartile of the triangles (T,) with a link, as half of the matches have it: wrong links open many."""
     links = corners.ravel()
     counts = np.bincount(links, minlength=len(observations))
     values = np.repeat(misclosure, 3)

@@ -109,9 +109,7 @@ class ReliefField:
         )
 
     def _response_to(self, fields: Fields, columns: int) -> tuple[float, FloatArray, FloatArray]:
-        """Agreement of neighbours, px², that fields leave in the mean, and the steps that answer each, (N, D, C) and
-        (S, C).
-        """
+        """Agreement of neighbours, px², that fields leave in the mean, and the steps (N, D, C) and (S, C) in answer."""
         poses, shared = self.response.steps_of(fields, columns)
         (first, second), agreement = self._pairs, 0.0
         for part in self.response.parts():

@@ -254,9 +254,7 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
     def joint(poses: FloatArray, other: FloatArray) -> FloatArray:
         """Covariances (N, D + S, D + S) of all parameters of an image with those of another one."""
         shared = np.broadcast_to(of_shared, (count, *of_shared.shape))
-        return np.concatenate(
-            [np.concatenate([poses, by_shared], axis=2), np.concatenate([other.swapaxes(1, 2), shared], axis=2)], axis=1
-        )
+        return np.block([[poses, by_shared], [other.swapaxes(1, 2), shared]])
 
     jacobian = pose_jacobian(model, parameters.poses, parameters.shared, problem.reference)
     jacobian = np.pad(jacobian, ((0, 0), (0, 0), (0, size + len(of_shared) - jacobian.shape[2])))  # by the lens

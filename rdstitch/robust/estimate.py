@@ -225,13 +225,10 @@ def _estimate_batch(pairs: list[PairMatches], options: EstimationOptions) -> lis
 def _selected(
     pair: PairMatches, best: Hypotheses, data: Measurements, tilts: FloatArray | None, options: EstimationOptions
 ) -> dict[int, PairFit]:
-    """The model of each pair, by its row, that has a hypothesis; ``pair`` is any of the batch.
-
-    Pairs with many inliers keep a free homography, where the options say so.
-    """
+    """The model of each pair, by its row, that has a hypothesis; ``pair`` is any of the batch."""
     solved = np.flatnonzero(np.isfinite(best.cost))
-    limit = np.inf if options.select_below is None else options.select_below
-    few = best.inliers[solved].sum(axis=1) < limit
+    # Pairs with many inliers keep a free homography, where the options say so.
+    few = best.inliers[solved].sum(axis=1) < (np.inf if options.select_below is None else options.select_below)
     selection = ModelSelection(options.threshold, options.distortion is not None)
     pairs = StartedPairs(data, best.homography, best.distortion, tilts)
     prior = pair.focal_prior

@@ -81,16 +81,14 @@ def cut_alignment(alignment: Alignment, sizes: Sequence[Size]) -> Alignment:
 
 
 def _with_scaled_lens(camera: Camera, ratio: float) -> Camera:
-    """The same lens where half the diagonal is so many times as long.
-
-    λ is limited to what a camera can have: only the estimate of a single pair lies beyond, where no match reaches.
-    """
+    """The same lens where half the diagonal is so many times as long."""
     powers = _powers(ratio)
     units, covariance = np.array([powers[name] for name in LENS_PARAMETERS]), camera.lens_covariance
     if covariance is not None:
         covariance = tuple(map(tuple, (units[:, None] * np.array(covariance) * units).tolist()))
     return replace(
         camera,
+        # What a camera cannot have is only the estimate of a single pair, where no match reaches.
         distortion=min(camera.distortion * powers["distortion"], MAX_ABS_DISTORTION),
         distortion2=camera.distortion2 * powers["distortion2"],
         distortion3=camera.distortion3 * powers["distortion3"],
