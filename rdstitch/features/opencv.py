@@ -56,12 +56,15 @@ def detect_opencv(grey: Grey, options: FeatureOptions, octaves: Sequence[int] | 
             scale=size,
             # OpenCV marks "no orientation" by -1.
             angle=np.where(degrees < 0, 0.0, np.radians(degrees) % (2 * np.pi)),
-            response=_strength(response, size, of_sift=of_sift),
+            response=response * size if of_sift else response,
             laplacian_sign=_laplacian_sign(grey, points, size) if of_sift else None,
             kind=options.kind,
         )
 
-    return Detection(table[:, :2], table[:, 2], _strength(table[:, 5], table[:, 2], of_sift=of_sift), describe)
+    # For SIFT contrast times size: by contrast alone the choice is mostly tiny ones, which drown in noise. On real
+    # pairs the product gives a fifth to a half more inliers, among other detectors it does not help.
+    response = table[:, 5] * table[:, 2] if of_sift else table[:, 5]
+    return Detection(table[:, :2], table[:, 2], response, describe)
 
 
 def _laplacian_sign(grey: Grey, points: FloatArray, size: FloatArray) -> NDArray[np.int8]:

@@ -56,9 +56,9 @@ class PairMatches:
         if self.quality is not None and np.isnan(self.quality).any():
             raise ArgumentError("quality has values that are NaN")
         if self.tilts is not None and self.tilts.shape != (2, 2):
-            raise ArgumentError(f"tilts must have shape (2, 2), not {self.tilts.shape}")
+            raise ArgumentError(f"tilt must be (psi, theta) or one such pair an image, not of shape {self.tilts.shape}")
         if self.tilts is not None and not (np.abs(self.tilts) < np.pi / 2.0).all():
-            raise ArgumentError("tilts must be below a right angle, in radians")
+            raise ArgumentError("tilt must be below a right angle, in radians")
 
     def __len__(self) -> int:
         """Number of matches."""
@@ -172,7 +172,10 @@ def estimate_radial_homography(
     options = EstimationOptions(solver, threshold, confidence, max_iterations, seed, distortion)
     p1, p2 = checked_matches(points1, points2)
     weights = None if quality is None else as_numbers("quality", quality)
-    pair = PairMatches(p1, p2, camera1, camera1.resized(size2), weights, _tilts(tilt))
+    tilts = None if tilt is None else as_numbers("tilt", tilt)
+    if tilts is not None and tilts.shape == (2,):
+        tilts = np.broadcast_to(tilts, (2, 2))
+    pair = PairMatches(p1, p2, camera1, camera1.resized(size2), weights, tilts)
     return estimate_radial_homographies([pair], options)[0]
 
 
@@ -239,16 +242,6 @@ def _selected(
             selected = selection.select(models, pairs.take(solved[rows]))
             fits.update(zip(solved[rows].tolist(), selected, strict=True))
     return fits
-
-
-def _tilts(tilt: ArrayLike | None) -> FloatArray | None:
-    """Tilts (2, 2) of both images, checked; None where they are not known."""
-    if tilt is None:
-        return None
-    angles = as_numbers("tilt", tilt)
-    if angles.shape not in ((2,), (2, 2)) or not np.isfinite(angles).all():
-        raise ArgumentError(f"tilt must be (psi, theta) or one such pair an image, finite, not {tilt!r}")
-    return np.broadcast_to(angles, (2, 2))
 
 
 def _solvers(options: EstimationOptions, focal: float, prior: Prior, tilts_known: bool) -> list[MinimalSolver]:

@@ -140,7 +140,7 @@ class _SolverState:
         return Sampler(self.solver.sample_size, self.options.max_iterations, [self.options.seed, self.index])
 
     def needed(self, best: Hypotheses, rows: IntArray, *, explore: bool = False) -> FloatArray:
-        """Samples after which a better model of some pairs has hardly been missed; ``explore``: that all solvers draw."""
+        """Samples after which a better model of some pairs was hardly missed; ``explore``: that all solvers draw."""
         counts = self.data.count[rows]
         agreeing = np.maximum(best.inliers[rows].sum(axis=1), MIN_OCCUPIED_CELLS)
         good = _SOLVER_SUCCESS * np.minimum(agreeing / counts, 1.0) ** self.solver.sample_size

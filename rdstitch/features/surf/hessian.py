@@ -174,10 +174,5 @@ def _neighbourhoods(
     determinant: NDArray[np.float32], layer: NDArray[np.intp], row: NDArray[np.intp], column: NDArray[np.intp]
 ) -> NDArray[np.float32]:
     """Values around places, shape (N, 3, 3, 3), axes layer, row, column."""
-    step = np.arange(-1, 2)
-    values: NDArray[np.float32] = determinant[
-        layer[:, None, None, None] + step[:, None, None],
-        row[:, None, None, None] + step[:, None],
-        column[:, None, None, None] + step,
-    ]
-    return values
+    places = np.stack([layer, row, column])[..., None, None, None] + np.indices((3, 3, 3))[:, None] - 1
+    return np.asarray(determinant[tuple(places)])
