@@ -45,18 +45,6 @@ class Hypotheses(Rows):
     solver: IntArray  # (B,), intp: which minimal solver found it
 
     @classmethod
-    def none(cls, data: Measurements) -> "Hypotheses":
-        """No hypothesis yet."""
-        count = len(data)
-        return cls(
-            np.full((count, 3, 3), np.nan),
-            np.zeros(count),
-            np.full(count, np.inf),
-            np.zeros(data.present.shape, dtype=np.bool_),
-            np.zeros(count, dtype=np.intp),
-        )
-
-    @classmethod
     def judged(
         cls, homography: FloatArray, distortion: FloatArray, data: Measurements, threshold: float, solver: int
     ) -> "Hypotheses":
@@ -97,9 +85,10 @@ def ransac(
     """
     quick = _subset(data)
     states = [_SolverState(solver, data, quick, ordered, tilts, options, index) for index, solver in enumerate(solvers)]
-    best = Hypotheses.none(data)
-    confident = np.zeros(len(data), dtype=np.bool_)
-    active = np.arange(len(data))
+    count = len(data)
+    none, solver = np.zeros(data.present.shape, dtype=np.bool_), np.zeros(count, dtype=np.intp)
+    best = Hypotheses(np.full((count, 3, 3), np.nan), np.zeros(count), np.full(count, np.inf), none, solver)
+    confident, active = np.zeros(count, dtype=np.bool_), np.arange(count)
     batch, hard = _FIRST_BATCH, active[:0]
     while len(active):
         for one, rows in [*((one, hard) for one in states[:-1]), (states[-1], active)]:

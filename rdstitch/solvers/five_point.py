@@ -39,11 +39,6 @@ def five_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, floa
     Solutions
         Every real λ in the range for which all points are in front of the camera and within the lens model, and the
         homography does not mirror.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong or the range is empty.
     """
 
     def solve(points: FloatArray, _: IndexArray) -> Solutions:

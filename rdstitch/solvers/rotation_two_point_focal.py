@@ -38,11 +38,6 @@ def rotation_two_point_focal(
     -------
     Solutions
         Every focal length in the range; none where a point is outside the lens model, or points coincide.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong or the range is empty.
     """
     low, high = focal_range
     if not 0.0 < low < high:

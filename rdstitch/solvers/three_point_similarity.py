@@ -46,11 +46,6 @@ def three_point_similarity(
     Solutions
         Every real λ in the range for which all points are in front of the camera and within the lens model and the
         triangle is not mirrored.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong or the range is empty.
     """
     rotations = TiltRotations.from_tilt(tilt, sample_count(x1))
 

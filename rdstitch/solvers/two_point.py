@@ -44,11 +44,6 @@ def two_point(
     -------
     Solutions
         Every real λ in the range for which all points are in front of the camera and within the lens model.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong or the range is empty.
     """
     rotations = TiltRotations.from_tilt(tilt, sample_count(x1))
 
