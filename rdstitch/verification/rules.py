@@ -220,8 +220,7 @@ class Rule(NamedTuple):
 _PLACES = frozenset(Purpose) - {Purpose.CALIBRATE}
 """A board shifted by a square is as straight as before: the lens is the same."""
 
-_POSES = frozenset({Purpose.TRAJECTORY})
-"""Pictures have their seams, a lens is the same."""
+_POSES = frozenset({Purpose.TRAJECTORY})  # pictures have their seams, a lens is the same
 
 OF_MATCHES = Rule(_mixed_lenses), Rule(_matches_disagree), Rule(_misfitting_images)
 """Failures by matches: images are left out before any pixels are compared."""
