@@ -13,7 +13,7 @@ from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.robust.posterior import Evidence, farthest_error
 from rdstitch.robust.priors import LENS_PRIORS, prior_costs
-from rdstitch.robust.refinement import PairEquations, PairProblems, refine_pairs
+from rdstitch.robust.refinement import PairEquations, PairProblems, descend
 
 _STEPS = 20  # of refinement; halved or doubled, the median error of λ changes by a sixth at most
 
@@ -111,7 +111,8 @@ class ModelSelection:
 
     def _fit(self, model: PairModel, pairs: StartedPairs) -> _Fitted:
         problems = self._problems(model, pairs)
-        return _Fitted(problems, *refine_pairs(problems, pairs.homography, pairs.distortion, pairs.tilts, _STEPS))
+        start = problems.start(pairs.homography, pairs.distortion, pairs.tilts)
+        return _Fitted(problems, *descend(problems, start, _STEPS))
 
     def _cost(self, fitted: _Fitted, evidence: Evidence, row: IntArray, column: IntArray) -> FloatArray:
         """-2 log of the posterior of a model of each pair (B,), by the matches at these places, up to a constant."""

@@ -14,7 +14,7 @@ from rdstitch.robust.chance import MIN_OCCUPIED_CELLS
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel
-from rdstitch.robust.refinement import PairProblems, refine_pairs
+from rdstitch.robust.refinement import PairProblems, descend
 from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.solvers.solutions import Solutions
@@ -208,7 +208,8 @@ class _SolverState:
         """The start or its refinement, whichever is better."""
         problems = PairProblems(model, data, np.full(len(data), scale), None, self.solver.fixed_distortion)
         tilts = None if self.tilts is None else self.tilts[rows]
-        refined, _ = refine_pairs(problems, start.homography, start.distortion, tilts, _LOCAL_STEPS, loose=True)
+        at = problems.start(start.homography, start.distortion, tilts)
+        refined, _ = descend(problems, at, _LOCAL_STEPS, loose=True)
         judged = Hypotheses.judged(
             problems.homography(refined), refined[:, 0], data, self.options.threshold, self.index
         )

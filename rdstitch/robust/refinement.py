@@ -61,6 +61,10 @@ class PairProblems:
         """Number of parameters of the lens that are estimated."""
         return 0 if self.fixed_distortion else 1 if self.lens is None else len(self.lens)
 
+    def start(self, homography: FloatArray, distortion: FloatArray, tilts: FloatArray | None = None) -> FloatArray:
+        """Parameters (B, 10) nearest to homographies (B, 3, 3) with λ (B,), and with known tilts (B, 2, 2)."""
+        return np.column_stack([distortion, self.model.initialize(homography, tilts)])
+
     def take(self, rows: BoolArray | IntArray) -> Self:
         """Some of them."""
         noise = None if self.noise is None else self.noise[rows]
@@ -130,6 +134,7 @@ class PairProblems:
         return covariances(equations.information, of_matches, jacobian, equations.noise, self.data)
 
 
+@np.errstate(all="ignore")  # a step may leave the domain of the lens model
 def descend(
     problems: PairProblems, start: FloatArray, iterations: int, *, loose: bool = False
 ) -> tuple[FloatArray, PairEquations]:
@@ -167,22 +172,3 @@ def descend(
     result[rows] = parameters
     equations.put(rows, current)
     return result, equations
-
-
-@np.errstate(all="ignore")  # a step may leave the domain of the lens model
-def refine_pairs(
-    problems: PairProblems,
-    homography: FloatArray,
-    distortion: FloatArray,
-    tilts: FloatArray | None,
-    iterations: int,
-    *,
-    loose: bool = False,
-) -> tuple[FloatArray, PairEquations]:
-    """Parameters (B, 10) that at most so many steps lead to, and the equations there.
-
-    From homographies (B, 3, 3), λ (B,), which is kept where it is fixed, and known tilts (B, 2, 2); ``loose``: another
-    refinement goes on from there.
-    """
-    state = problems.model.initialize(homography, tilts)
-    return descend(problems, np.column_stack([distortion, state]), iterations, loose=loose)
