@@ -58,4 +58,8 @@ class Rows:
         for name in self.__dataclass_fields__:
             getattr(self, name)[rows] = getattr(others, name)
 
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(getattr(self, next(iter(self.__dataclass_fields__))))
+
     __getitem__, __setitem__ = take, put

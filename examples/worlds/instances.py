@@ -4,13 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from rdstitch.arrays import FloatArray
-from rdstitch.geometry.division_model import distort
+from rdstitch.geometry.division_model import distort, divisor
 from rdstitch.geometry.planar_motion import PlanarMotion, rigid_in_plane, rotation_from_tilt
-from rdstitch.geometry.radial_homography import lift, project
+from rdstitch.geometry.radial_homography import project
 from rdstitch.solvers.solutions import Solutions
 
 Range = tuple[float, float]
@@ -23,6 +23,13 @@ HALF_SIZE = (0.8, 0.6)
 # Rays meet the plane within ten heights of the camera: what lies nearer to the horizon is no use to anybody.
 _MIN_STEEPNESS = 0.1
 _MAX_ROUNDS = 200
+
+
+def lift(points: ArrayLike, distortion: ArrayLike) -> FloatArray:
+    """``(x, y, 1 + λ r²)`` of normalized points (..., 2); shape (..., 3). λ broadcasts."""
+    x = np.asarray(points, dtype=np.float64)
+    third = divisor(np.einsum("...i,...i->...", x, x), distortion)
+    return np.concatenate([np.broadcast_to(x, (*third.shape, 2)), third[..., None]], axis=-1)
 
 
 @dataclass(frozen=True)

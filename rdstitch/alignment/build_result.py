@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from rdstitch.alignment import sentences
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.alignment_options import GivenImages
 from rdstitch.alignment.frames.level_frame import levelled
@@ -17,13 +18,6 @@ from rdstitch.alignment.near_copies import with_near_copies
 from rdstitch.alignment.noise import coherence, shows_relief
 from rdstitch.alignment.result import Alignment, LinkFit, PlanarPoses, ReliefTest, Unused
 from rdstitch.alignment.select import ModelChoice
-from rdstitch.alignment.sentences import (
-    few_images,
-    focal_overruled,
-    lens_not_observable,
-    not_converged,
-    relief_explained,
-)
 from rdstitch.alignment.uncertainty import considered_covariance, lever_std, pose_covariances
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ImpossibleCameraError
@@ -113,7 +107,7 @@ class AdjustedImages:
         """Whether the scene is the plane that it is taken for."""
         seen = self.problem.observations
         left = coherence(seen, self.errors, seen.inliers(self.squared))
-        explanation = relief_explained(left, self.fit.model, len(seen))
+        explanation = sentences.relief_explained(left, self.fit.model, len(seen))
         return ReliefTest(shows_relief(left), left.correlation, left.size, explanation)
 
     def of_all(self, values: FloatArray) -> FloatArray:
@@ -270,16 +264,16 @@ def _messages(adjusted: AdjustedImages, camera: Camera) -> tuple[Message, ...]:
     result, lens, known = list[Message](), adjusted.lens, adjusted.problem.camera_priors
     purpose, fit = adjusted.given.options.purpose, adjusted.fit
     if not lens.observable:
-        result.append(lens_not_observable(purpose, lens.evidence))
+        result.append(sentences.lens_not_observable(purpose, lens.evidence))
     elif (count := len(adjusted.images)) < ENOUGH_IMAGES and adjusted.problem.free_lens.any():
         every = replace(camera, lens_covariance=tuple(map(tuple, adjusted.considered_lens_covariance.tolist())))
         off = _CONFIDENT * float(radius_std(every, _RADII)[-1])
         if off > _WORTH_SAYING:
-            result.append(few_images(count, ENOUGH_IMAGES, off, purpose))
+            result.append(sentences.few_images(count, ENOUGH_IMAGES, off, purpose))
     if known.focal_source == "exif" and fit.model.one_camera and camera.focal is not None:
         ratio = camera.focal / camera.scale / math.exp(known.log_focal)
         if abs(math.log(ratio)) >= math.log(_OVERRULED):
-            result.append(focal_overruled(ratio))
+            result.append(sentences.focal_overruled(ratio))
     if not fit.result.converged:
-        result.append(not_converged(purpose))
+        result.append(sentences.not_converged(purpose))
     return (*result, *adjusted.messages)

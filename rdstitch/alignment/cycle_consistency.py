@@ -125,10 +125,7 @@ def _open_triangles(pairwise: BundleAdjustmentResult, observations: Observations
 
 
 def _usual_misclosure(misclosure: FloatArray, corners: IntArray, observations: Observations) -> float:
-    """The lower quartile of the triangles (T,) with a link, as half of the matches have it.
-
-    Not that of all triangles: each wrong link between images far apart opens many.
-    """
+    """The lower quartile of the triangles (T,) with a link, as half of the matches have it: wrong links open many."""
     links = corners.ravel()
     counts = np.bincount(links, minlength=len(observations))
     values = np.repeat(misclosure, 3)
@@ -171,8 +168,7 @@ def misfitting_links(squared: FloatArray, observations: Observations) -> BoolArr
     typical = observations.medians(np.sqrt(squared))
     usual = _weighted_median(typical, np.where(np.isfinite(typical), observations.matches, 0))
     tolerance = _MIN_ERROR * np.sqrt(observations.scale1 * observations.scale2)
-    outlying: BoolArray = ~(typical <= np.maximum(_OUTLYING * usual, tolerance))
-    return outlying
+    return ~(typical <= np.maximum(_OUTLYING * usual, tolerance))
 
 
 def _weighted_median(values: FloatArray, weights: IntArray) -> float:

@@ -12,19 +12,13 @@ from itertools import product
 
 import numpy as np
 
+from rdstitch.alignment import sentences
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.alignment_options import AlignmentOptions
 from rdstitch.alignment.delays import at_delay, smooth
 from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.motion_models import MODELS, POSE, PSI, THETA
 from rdstitch.alignment.select import select_model
-from rdstitch.alignment.sentences import (
-    attitudes_contradicted,
-    attitudes_late,
-    attitudes_scatter,
-    focal_contradicted,
-    tilt_contradicted,
-)
 from rdstitch.alignment.starts import start_from
 from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
 from rdstitch.choices import ModelName
@@ -67,7 +61,7 @@ def check_attitudes(problem: Problem, options: AlignmentOptions) -> tuple[Alignm
     if delayed is not None and (late := shown.delay(delayed + priors.tilt)) is not None:
         attitudes, of_all = (at_delay(np.asarray(values), late[0]) for values in (delayed, options.delayed_attitudes))
         options = replace(options, attitudes=of_all, delayed_attitudes=None)
-        messages.append(attitudes_late(*late))
+        messages.append(sentences.attitudes_late(*late))
     if (contradiction := _contradiction(shown, attitudes + priors.tilt, options)) is not None:
         options, message = contradiction
         messages.append(message)
@@ -91,12 +85,12 @@ def _contradiction(
         return None
     if max(as_changed, without_any) >= as_given + _LOG_ODDS:
         if options.attitudes is None:
-            return _without_tilts(options), tilt_contradicted(given[0], np.median(shown.tilts, axis=0))
+            return _without_tilts(options), sentences.tilt_contradicted(given[0], np.median(shown.tilts, axis=0))
         change = _SIGNED_ORDERS[likeliest] if as_changed > without_any + _LOG_ODDS else None
-        return _without_tilts(options), attitudes_contradicted(scatter, change, max(scatter_changed, _EXACT))
+        return _without_tilts(options), sentences.attitudes_contradicted(scatter, change, max(scatter_changed, _EXACT))
     if options.attitudes is None:
         return None
-    return replace(options, attitudes_std=scatter), attitudes_scatter(scatter, stated)
+    return replace(options, attitudes_std=scatter), sentences.attitudes_scatter(scatter, stated)
 
 
 def _fit_without_tilts(problem: Problem, options: AlignmentOptions) -> tuple[Problem, Fit] | None:
@@ -132,7 +126,7 @@ def check_focal(given: Camera, fit: Fit, covariance: FloatArray | None) -> Messa
     place = fit.model.shared_names.index("log_focal")
     focal, std = fit.model.focal(fit.result.parameters.shared) * given.scale, math.sqrt(covariance[place, place])
     _, contradicted = judged_focal(given.focal_log_std, math.log(focal / given.focal), std)
-    return focal_contradicted(given.focal, focal, std) if contradicted else None
+    return sentences.focal_contradicted(given.focal, focal, std) if contradicted else None
 
 
 def judged_focal(stated_std: float, shown: float, shown_std: float) -> tuple[float, bool]:

@@ -53,10 +53,6 @@ class MapFit:
     disagreement: Message | None = None
     leverage: Mapping[int | str, float] = field(default_factory=dict)  # by image of the problem, and name of a point
 
-    def leverage_of(self, images: IntArray) -> dict[int | str, float]:
-        """The leverage by the numbers that images of the problem have among all images (N,)."""
-        return {key if isinstance(key, str) else int(images[key]): value for key, value in self.leverage.items()}
-
 
 def adjust_to_map(problem: Problem, fit: Fit) -> MapFit:
     """Adjust again with positions and control points as priors, where there are enough of them, and they agree."""
@@ -127,8 +123,7 @@ class _Positions(_KnownPlaces):
         self.labels, self.item = np.flatnonzero(self.known).tolist(), np.arange(len(self.metres))
 
     def estimated(self, fit: Fit) -> ComplexArray:
-        places: ComplexArray = fit.result.parameters.poses[self.known][:, [X, Y]] @ _COMPLEX
-        return places
+        return np.asarray(fit.result.parameters.poses[self.known][:, [X, Y]] @ _COMPLEX)
 
     def prior(self, priors: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
         places, weights = np.zeros((len(self.known), 2)), np.zeros(len(self.known))
@@ -149,28 +144,31 @@ class _Control(_KnownPlaces):
 
     def __init__(self, problem: Problem, fit: Fit) -> None:
         given = problem.camera_priors.control
-        shown = np.flatnonzero(np.isfinite(_sightings(given, fit)).all(axis=1))
-        self.points = control = given.subset(shown)
-        self.metres = control.places @ np.array([1.0, -1.0j])
-        self.count = np.bincount(control.point, minlength=len(control.names))
-        self.std, self.labels, self.item = np.maximum(control.std, MILLIMETRE), control.names, control.point
+        self.points = control = given.take(np.asarray(np.isfinite(_sightings(given, fit)).all(axis=1)))
+        self.labels = list(dict.fromkeys(control.name.tolist()))
+        self.item = np.array([self.labels.index(name) for name in control.name.tolist()], dtype=np.intp)
+        self.count = np.bincount(self.item, minlength=len(self.labels))
+        first = np.unique(self.item, return_index=True)[1]
+        self.metres, self.std = (
+            control.place[first] @ np.array([1.0, -1.0j]),
+            np.maximum(control.std[first], MILLIMETRE),
+        )
         if len(self.metres) >= self.min_count:
             places = self.estimated(fit)
-            pixel = np.bincount(control.point, control.pixel) / self.count
+            pixel = np.bincount(self.item, control.pixel) / self.count
             scale = abs(fit_similarity(places, self.metres, float(np.median(self.std))).scale)
             self.std = np.hypot(self.std, _CLICK * pixel * scale)
 
     def estimated(self, fit: Fit) -> ComplexArray:
         sums = np.zeros((len(self.metres), 2))
-        np.add.at(sums, self.points.point, _sightings(self.points, fit))
-        means: ComplexArray = (sums / self.count[:, None]) @ _COMPLEX
-        return means
+        np.add.at(sums, self.item, _sightings(self.points, fit))
+        return np.asarray((sums / self.count[:, None]) @ _COMPLEX)
 
     def prior(self, priors: CameraPriors, target: FloatArray, precision: FloatArray) -> CameraPriors:
         shown = self.points
         # What a point is off by is the same in all images that show it.
-        shared = (precision / self.count)[shown.point]
-        return replace(priors, marks=PlaneMarks(shown.image, shown.points, target[shown.point], shared))
+        shared = (precision / self.count)[self.item]
+        return replace(priors, marks=PlaneMarks(shown.image, shown.points, target[self.item], shared))
 
     def jacobians(self, adjuster: BundleAdjuster, fit: Fit) -> tuple[IntArray, FloatArray, FloatArray]:
         parameters, marks = fit.result.parameters, adjuster.priors.marks
@@ -182,10 +180,8 @@ class _Control(_KnownPlaces):
 
 def _sightings(control: ControlPoints, fit: Fit) -> FloatArray:
     """Where a fit has each sighting of control points, (M, 2); not finite where no place looks like that."""
-    adjusted, marks = (
-        fit.result,
-        PlaneMarks(control.image, control.points, control.points, np.zeros(len(control.image))),
-    )
+    adjusted = fit.result
+    marks = PlaneMarks(control.image, control.points, control.points, np.zeros(len(control)))
     focal = fit.model.focal(adjusted.parameters.shared)
     return marks.places(adjusted.matrices.matrices, adjusted.parameters.lens, focal)
 

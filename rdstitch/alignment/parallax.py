@@ -53,8 +53,7 @@ class Parallax:
         """Places (m, 2) from the middle of the images, in sizes of one; far beyond them (at a horizon), less far."""
         middle = np.median(self._centres, axis=0)
         reach = self.size + 2.0 * np.median(np.linalg.norm(self._centres - middle, axis=1))
-        near: FloatArray = np.clip(place - middle, -reach, reach) / self.size
-        return near
+        return np.clip(place - middle, -reach, reach) / self.size
 
     @cached_property
     def _back(self) -> FloatArray:
@@ -78,8 +77,7 @@ class Parallax:
         """Sizes (N,) of half a diagonal of each image on the plane, or between directions."""
         aside = [self._places(self._back @ np.array([x, y, 1.0])) for x, y in ((_ASIDE, 0.0), (0.0, _ASIDE))]
         away = [np.linalg.norm(places - self._centres, axis=1) / _ASIDE for places in aside]
-        sizes: FloatArray = np.maximum((away[0] + away[1]) / 2.0, 1e-12)
-        return sizes
+        return np.asarray(np.maximum((away[0] + away[1]) / 2.0, 1e-12))
 
     @cached_property
     def _nadirs(self) -> tuple[FloatArray, FloatArray]:
@@ -90,16 +88,10 @@ class Parallax:
         poses = model.metric_poses(parameters.poses, parameters.shared)
         return poses[:, [X, Y]], np.exp(poses[:, LOG_HEIGHT])
 
-    @cached_property
-    def _shifts(self) -> FloatArray:
-        """Shifts (N, 2) of the camera away from where it turns, one an image: any, since nothing is known of them."""
-        return np.random.default_rng(0).normal(size=(len(self._back), 2))
-
     def _moved(self, place: FloatArray, images: IntArray) -> FloatArray:
         """Motion (m, 2) of measured points of places in their images (m,) with the height of the ground."""
-        if self.is_turn:
-            shift: FloatArray = self._shifts[images]
-            return shift
+        if self.is_turn:  # any shift of the camera away from where it turns, one an image: nothing is known of them
+            return np.random.default_rng(0).normal(size=(len(self._back), 2))[images]
         lens, matrices = self.result.parameters.lens, self.result.matrices.matrices[images]
         distortion, higher, _ = split_lens(lens)
         nadirs, heights = self._nadirs
@@ -108,5 +100,4 @@ class Parallax:
         for step in (_STEP, -_STEP):
             lifted = np.column_stack([place + step * self.size * away, np.ones(len(place))])
             ends.append(distort(project(np.einsum("mij,mj->mi", matrices, lifted)), distortion, higher))
-        moved: FloatArray = (ends[0] - ends[1]) / (2.0 * _STEP)
-        return moved
+        return (ends[0] - ends[1]) / (2.0 * _STEP)

@@ -14,8 +14,7 @@ from rdstitch.alignment.given_checks import check_attitudes, check_focal, is_str
 from rdstitch.alignment.known_model import KnownModel
 from rdstitch.alignment.least_squares.bundle_adjustment import FEW_GAIN, MIN_GAIN
 from rdstitch.alignment.least_squares.observations import Observations
-from rdstitch.alignment.least_squares.priors import CameraPriors
-from rdstitch.alignment.lens.lens_selection import LensChoice, with_third_coefficient
+from rdstitch.alignment.lens.lens_selection import with_third_coefficient
 from rdstitch.alignment.lens.observability import choose_observable_lens
 from rdstitch.alignment.map_priors import adjust_to_map
 from rdstitch.alignment.noise import independent_errors
@@ -25,7 +24,7 @@ from rdstitch.alignment.select import ModelChoice, select_model
 from rdstitch.alignment.sentences import REFERENCE_LEFT_OUT
 from rdstitch.alignment.starts import fit_model
 from rdstitch.alignment.uncertainty import covariances, weigh_lens
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, IntArray
 from rdstitch.errors import ArgumentError, ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
@@ -86,15 +85,21 @@ class AlignmentTask(GivenImages):
         return _lens_and_model(self, self.known)
 
 
-def _full_size_reference(problem: Problem, cameras: Sequence[Camera]) -> int:
-    """The reference, or, where that is a reduced image, the one of full size whose links can be relied on most."""
-    size = np.sqrt([float(np.prod(camera.image_size)) for camera in cameras])
-    full = np.flatnonzero(size > _REDUCED * size.max())
-    if problem.reference in full:
-        return problem.reference
-    observed = problem.observations
-    trust = sum(np.bincount(images, problem.trust, len(size)) for images in (observed.image1, observed.image2))
-    return int(full[np.argmax(np.asarray(trust)[full])])
+def _with_reference(all_links: Problem, cameras: Sequence[Camera], wrong: BoolArray) -> Problem:
+    """The problem with the reference that was asked for, or that of a part of it without the links that are wrong.
+
+    Where that is a reduced image, the one of full size whose links can be relied on most.
+    """
+    if all_links.fixed is not None:
+        return all_links
+    problem, images = all_links.part(~wrong)
+    size = np.sqrt([float(np.prod(cameras[k].image_size)) for k in images])
+    full, reference = np.flatnonzero(size > _REDUCED * size.max()), problem.reference
+    if reference not in full:
+        ends = problem.observations.image1, problem.observations.image2
+        trust = sum(np.bincount(of, problem.trust, len(size)) for of in ends)
+        reference = int(full[np.argmax(np.asarray(trust)[full])])
+    return replace(all_links, fixed=int(images[reference]))
 
 
 def _lens_and_model(given: GivenImages, known: KnownModel | None = None) -> AdjustedImages:
@@ -108,7 +113,16 @@ def _lens_and_model(given: GivenImages, known: KnownModel | None = None) -> Adju
     distortion = float(lens.pairwise.parameters.lens[0])
     priors = priors.with_lens(distortion)
     wrong, confirmed = cycle_consistency(lens.pairwise, sample, len(given.cameras))
-    all_links = _problem_of_all_links(given, known, sample, lens, _tree_ranks(sample, confirmed), priors, wrong)
+    # A tree of the links with a consistent triangle first, by their matches. Where all have as many, one of the first
+    # links might pass over neighbours, and join them a whole path away: the area of the matches decides.
+    ranks = np.argsort(np.lexsort((sample.areas, sample.matches, confirmed > 0))).astype(np.float64)
+    homographies, start, count = lens.pairwise.homographies, lens.pairwise.parameters.lens, len(given.cameras)
+    reference = given.options.reference
+    reference = known.reference if reference is None and known is not None else reference
+    all_links = Problem(
+        sample, homographies, start, lens.free, priors, trust=ranks, count=count, fixed=reference, min_gain=FEW_GAIN
+    )
+    all_links = _with_reference(all_links, given.cameras, wrong)
     connected, images = all_links.part(~wrong)
     # Data weigh against priors as they will in the final adjustment.
     shared, _ = independent_errors(connected.observations, connected.homographies, connected.lens)
@@ -134,28 +148,6 @@ def _lens_and_model(given: GivenImages, known: KnownModel | None = None) -> Adju
         replace(lens.refined(free), pairwise=lens.pairwise.bare),
         messages=tuple(messages),
     )
-
-
-def _problem_of_all_links(
-    given: GivenImages,
-    known: KnownModel | None,
-    sample: Observations,
-    lens: LensChoice,
-    trust: FloatArray,
-    priors: CameraPriors,
-    wrong: BoolArray,
-) -> Problem:
-    """The problem of all images, with the reference that was asked for, or else a good one of those not ``wrong``."""
-    homographies, start = lens.pairwise.homographies, lens.pairwise.parameters.lens
-    count, reference = len(given.cameras), given.options.reference
-    reference = known.reference if reference is None and known is not None else reference
-    all_links = Problem(
-        sample, homographies, start, lens.free, priors, trust=trust, count=count, fixed=reference, min_gain=FEW_GAIN
-    )
-    if reference is None:
-        problem, images = all_links.part(~wrong)
-        reference = int(images[_full_size_reference(problem, [given.cameras[k] for k in images])])
-    return replace(all_links, fixed=reference)
 
 
 def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
@@ -186,7 +178,9 @@ def _adjusted(chosen: AdjustedImages) -> AdjustedImages:
         choice=replace(choice, fit=fit),
         lens=chosen.lens.refined(problem.free_lens),
         messages=(*filter(None, [on_map.disagreement]), *chosen.messages),
-        leverage=on_map.leverage_of(chosen.images),
+        leverage={
+            key if isinstance(key, str) else int(chosen.images[key]): one for key, one in on_map.leverage.items()
+        },
         covariance=covariance,
         lens_covariance=of_lens,
     )
@@ -256,15 +250,6 @@ def _check(given: GivenImages) -> None:
         raise ArgumentError(f"the reference image {options.reference} is not among the {len(cameras)}")
     if options.lens_known and len({camera.coefficients for camera in cameras}) > 1:
         raise ArgumentError("the images have lenses that differ: those of one lens are aligned at a time")
-
-
-def _tree_ranks(observations: Observations, confirmed: IntArray) -> FloatArray:
-    """Ranks of the links for the spanning tree: those with a consistent triangle first, by their matches, and by the
-    area of these where they are as many.
-
-    Where all are as many, a tree of the first links may pass over neighbours, and join them a whole path away.
-    """
-    return np.argsort(np.lexsort((observations.areas, observations.matches, confirmed > 0))).astype(np.float64)
 
 
 def _drop_wrong_pairs(

@@ -79,8 +79,7 @@ class ReliefField:
         place, parallax = self._parallax.of(part)
         x, y = self._parallax.from_middle(place).T
         heights = np.column_stack([x * x, math.sqrt(2.0) * x * y, y * y])
-        field: FloatArray = parallax[:, :, None] * heights[:, None, :]
-        return field
+        return np.asarray(parallax[:, :, None] * heights[:, None, :])
 
     def _agreement(self) -> float:
         """Mean product of the errors of neighbours, px², beyond what the absorption of independent errors leaves: less
@@ -110,9 +109,7 @@ class ReliefField:
         )
 
     def _response_to(self, fields: Fields, columns: int) -> tuple[float, FloatArray, FloatArray]:
-        """Agreement of neighbours, px², that fields leave in the mean, and the steps that answer each, (N, D, C) and
-        (S, C).
-        """
+        """Agreement of neighbours, px², that fields leave in the mean, and the steps (N, D, C) and (S, C) in answer."""
         poses, shared = self.response.steps_of(fields, columns)
         (first, second), agreement = self._pairs, 0.0
         for part in self.response.parts():
@@ -133,8 +130,7 @@ class ReliefField:
             place, parallax = self._parallax.of(part)
             phase = place @ waves.T
             heights = np.concatenate([height * np.cos(phase), height * np.sin(phase)], axis=1)
-            field: FloatArray = parallax[:, :, None] * heights[:, None, :]
-            return field
+            return np.asarray(parallax[:, :, None] * heights[:, None, :])
 
         return fields
 
@@ -146,8 +142,7 @@ class ReliefField:
     def _pairs(self) -> IntArray:
         """Inliers and neighbours of theirs in the same link, (2, P), by the first of each pair."""
         pairs = neighbours(self.response.adjuster.observations, self.response.result.inliers)
-        nearest: IntArray = np.unique(np.sort(np.stack(pairs), axis=0), axis=1)
-        return nearest
+        return np.unique(np.sort(np.stack(pairs), axis=0), axis=1)
 
 
 def _variance_between(information: FloatArray, score: FloatArray) -> float:

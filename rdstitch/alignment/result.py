@@ -198,8 +198,7 @@ class Alignment:
 
     def relation(self, image1: int, image2: int) -> FloatArray:
         """Homography (3, 3) from undistorted normalized coordinates of one image to those of another."""
-        product: FloatArray = np.linalg.solve(self.homographies[image2], self.homographies[image1])
-        return product
+        return np.linalg.solve(self.homographies[image2], self.homographies[image1])
 
     @cached_property
     def distortion(self) -> float:

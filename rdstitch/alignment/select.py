@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
 
 import numpy as np
 
@@ -89,11 +88,6 @@ class Posterior:
         return evidence_of(self.problem.observations, self.link_errors)
 
     @cached_property
-    def least_field(self) -> float:
-        """Pixels: what neighbours share of the errors of links on their own, which no model undercuts by much."""
-        return float(self.evidence.field(self.link_errors)[0])
-
-    @cached_property
     def tolerable(self) -> float:
         """Shared errors, pixels of a coordinate, that local alignment and seams can hide."""
         return math.hypot(_TOLERABLE * float(self.evidence.farthest[0]), float(self.evidence.noise[0]))
@@ -111,13 +105,16 @@ class Posterior:
 
     def lower_bound(self, model: MotionModel, errors: FloatArray, free_lens: BoolArray | None = None) -> float:
         """The cost of a model that leaves such errors (M, 2), of a camera that is as cameras are."""
-        free = parameter_count(self.problem, model, self.problem.free_lens if free_lens is None else free_lens)
+        # In the pose model the shared tilt is only the mean of those of the images.
+        poses = self.problem.count * model.pose_size - int(model.gauge.sum()) - (2 if model.any_tilt else 0)
+        lens = self.problem.free_lens if free_lens is None else free_lens
         preference = TWENTY_TO_ONE if model.on_sphere != (self.purpose is Purpose.PANO) else 0.0
-        return float(self.evidence.cost(errors, free, preference)[0])
+        return float(self.evidence.cost(errors, poses + len(model.shared_names) + int(lens.sum()), preference)[0])
 
     def suffices(self, best: Hypothesis, model: MotionModel) -> bool:
         """Whether a freer model could not be taken, even if it left the errors that links leave on their own."""
-        if not model.one_camera and not _is_beyond_one_camera(self, best, self.least_field):
+        # What neighbours share of these errors no model undercuts by much.
+        if not (model.one_camera or _is_beyond_one_camera(self, best, float(self.evidence.field(self.link_errors)[0]))):
             return True
         return not best.implausible and best.cost <= self.lower_bound(model, self.link_errors)
 
@@ -136,35 +133,29 @@ def select_model(
     models = [MODELS[name] for name in names]
     planar = [model for model in models if not model.on_sphere]
     wide = replace(problem, free_lens=np.logical_or.reduce([problem.free_lens, *lenses]))
-    turns = [_TurnTrial.of(posterior, wide, model) for model in models if model.on_sphere]
-    bar = posterior.lower_bound(planar[0], posterior.link_errors) if planar else math.inf
-    early = [turn.hypothesis(posterior) for turn in turns if turn.bound < bar]
-    tried = _with_planar(posterior, early, planar, free=not all(model.one_camera for model in models))
-    for turn in (turn for turn in turns if turn.bound >= bar):
+    turns = [model for model in models if model.on_sphere]  # one at most
+    bound, shared = _bound_of_turn(posterior, wide, turns[0]) if turns else (math.inf, None)
+
+    def turned() -> list[Hypothesis]:
+        return [posterior.hypothesis(fit_model(problem, model, shared=shared)) for model in turns]
+
+    late = bool(planar and turns) and bound >= posterior.lower_bound(planar[0], posterior.link_errors)
+    free = not all(model.one_camera for model in models)
+    tried = _with_planar(posterior, [] if late else turned(), planar, free=free)
+    if late:
         best = min((one for one in tried if one.fit.model.one_camera), key=_cost)
-        if best.implausible or turn.bound < best.cost:
-            tried.insert(0, turn.hypothesis(posterior))
+        if best.implausible or bound < best.cost:
+            tried = [*turned(), *tried]
     tried = _with_wider_lenses(posterior, tried, lenses)
     return _choice(tried, _best(posterior, tried), requested=len(names) == 1)
 
 
-@dataclass(frozen=True, eq=False)
-class _TurnTrial:
-    """What links that are turns on their own say of a turn of all images: its cost is no less than the bound."""
-
-    model: MotionModel
-    bound: float
-    shared: FloatArray | None  # parameters to start from
-
-    @classmethod
-    def of(cls, posterior: Posterior, problem: Problem, model: MotionModel) -> Self:
-        if len(problem.observations) == 1:  # a trial is the whole
-            return cls(model, -math.inf, None)
-        pairs, shared = fit_pairwise(problem, model)
-        return cls(model, posterior.lower_bound(model, pairs.errors), shared)
-
-    def hypothesis(self, posterior: Posterior) -> Hypothesis:
-        return posterior.hypothesis(fit_model(posterior.problem, self.model, shared=self.shared))
+def _bound_of_turn(posterior: Posterior, problem: Problem, model: MotionModel) -> tuple[float, FloatArray | None]:
+    """What a turn of all images costs at least, by links that are turns on their own, and parameters to start from."""
+    if len(problem.observations) == 1:  # a trial is the whole
+        return -math.inf, None
+    pairs, shared = fit_pairwise(problem, model)
+    return posterior.lower_bound(model, pairs.errors), shared
 
 
 def _with_planar(
@@ -234,12 +225,6 @@ def _is_beyond_one_camera(posterior: Posterior, best: Hypothesis, free: float) -
     """Whether free homographies compete, of a picture whatever their field is; two images need no more than one."""
     largest = posterior.tolerable if posterior.purpose.picture else _MIN_RATIO * free
     return posterior.problem.count == 2 or best.implausible or best.field > largest
-
-
-def parameter_count(problem: Problem, model: MotionModel, free_lens: BoolArray) -> int:
-    """Number of free parameters; in the pose model the shared tilt is only the mean of those of the images."""
-    poses = problem.count * model.pose_size - int(model.gauge.sum())
-    return poses + len(model.shared_names) + int(free_lens.sum()) - (2 if model.any_tilt else 0)
 
 
 def _choice(tried: Sequence[Hypothesis], best: Hypothesis, *, requested: bool) -> ModelChoice:

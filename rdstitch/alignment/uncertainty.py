@@ -154,8 +154,7 @@ def _by_images(observations: Observations, influence: FloatArray) -> FloatArray:
     np.add.at(link, observations.link, influence)
     for images in (observations.image1, observations.image2):
         np.add.at(image, images, link)
-    covariance: FloatArray = image.T @ image - link.T @ link
-    return covariance
+    return image.T @ image - link.T @ link
 
 
 def considered_covariance(problem: Problem, fit: Fit, covariance: FloatArray, *, over_relief: bool) -> FloatArray:
@@ -191,8 +190,7 @@ def _with_free_motion(problem: Problem, fit: Fit, covariance: FloatArray, *, ove
     of_free = 1.0 / (1.0 + math.exp(against))
     off = free.result.parameters.lens - fit.result.parameters.lens
     other = considered_covariance(problem, free, covariances(problem, free)[1], over_relief=over_relief)
-    mixed: FloatArray = (1.0 - of_free) * covariance + of_free * (other + np.outer(off, off))
-    return mixed
+    return (1.0 - of_free) * covariance + of_free * (other + np.outer(off, off))
 
 
 def weigh_lens(problem: Problem, fit: Fit, covariance: FloatArray) -> Fit:
@@ -256,9 +254,7 @@ def pose_covariances(problem: Problem, fit: Fit) -> tuple[FloatArray, FloatArray
     def joint(poses: FloatArray, other: FloatArray) -> FloatArray:
         """Covariances (N, D + S, D + S) of all parameters of an image with those of another one."""
         shared = np.broadcast_to(of_shared, (count, *of_shared.shape))
-        return np.concatenate(
-            [np.concatenate([poses, by_shared], axis=2), np.concatenate([other.swapaxes(1, 2), shared], axis=2)], axis=1
-        )
+        return np.block([[poses, by_shared], [other.swapaxes(1, 2), shared]])
 
     jacobian = pose_jacobian(model, parameters.poses, parameters.shared, problem.reference)
     jacobian = np.pad(jacobian, ((0, 0), (0, 0), (0, size + len(of_shared) - jacobian.shape[2])))  # by the lens

@@ -119,16 +119,10 @@ class PackedFeatures:
 
 def _smallest(descriptors: Descriptors) -> NDArray[Any]:
     """Descriptors in the smallest type that holds them."""
-    if descriptors.dtype == np.uint8:
-        return descriptors
-    if not len(descriptors):
-        return descriptors.astype(np.float16)
-    if descriptors.min() >= 0.0 and descriptors.max() <= 255.0:
-        integers = descriptors.astype(np.uint8)
-        if np.array_equal(integers, descriptors):
-            return integers
-    half = np.abs(descriptors).max() <= _MAX_HALF
-    return descriptors.astype(np.float16 if half else np.float32)
+    integers = np.clip(descriptors, 0, 255).astype(np.uint8)
+    if np.array_equal(integers, descriptors):
+        return integers
+    return descriptors.astype(np.float16 if np.abs(descriptors).max() <= _MAX_HALF else np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +146,3 @@ class Correspondences(Rows):
     def of(cls, features1: Features, features2: Features, indices: NDArray[np.intp], ratio: FloatArray) -> Self:
         """Correspondences between the features of two images."""
         return cls(indices, features1.points[indices[:, 0]], features2.points[indices[:, 1]], ratio)
-
-    def __len__(self) -> int:
-        return len(self.ratio)

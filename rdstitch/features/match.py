@@ -102,8 +102,7 @@ def _within(expected: FloatArray, points: FloatArray, radius: float) -> NDArray[
 
 def _places(points: FloatArray) -> NDArray[np.intp]:
     """Number the places of points, equal where they coincide: SIFT gives a point several descriptors."""
-    number: NDArray[np.intp] = np.unique(points, axis=0, return_inverse=True)[1].reshape(-1)
-    return number
+    return np.unique(points, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _best_of_each(groups: NDArray[np.intp], distance: FloatArray) -> NDArray[np.intp]:

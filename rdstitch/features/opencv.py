@@ -1,6 +1,6 @@
 """The detectors that OpenCV brings, in the steps that all detectors take: find, choose, describe."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from operator import attrgetter
 from typing import Any, cast
 
@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.choices import FeatureName
 from rdstitch.errors import ArgumentError
 from rdstitch.features.keypoints import Descriptors, Detection, Features
 from rdstitch.options.feature_options import FeatureOptions
@@ -57,12 +56,15 @@ def detect_opencv(grey: Grey, options: FeatureOptions, octaves: Sequence[int] | 
             scale=size,
             # OpenCV marks "no orientation" by -1.
             angle=np.where(degrees < 0, 0.0, np.radians(degrees) % (2 * np.pi)),
-            response=_strength(response, size, of_sift=of_sift),
+            response=response * size if of_sift else response,
             laplacian_sign=_laplacian_sign(grey, points, size) if of_sift else None,
             kind=options.kind,
         )
 
-    return Detection(table[:, :2], table[:, 2], _strength(table[:, 5], table[:, 2], of_sift=of_sift), describe)
+    # For SIFT contrast times size: by contrast alone the choice is mostly tiny ones, which drown in noise. On real
+    # pairs the product gives a fifth to a half more inliers, among other detectors it does not help.
+    response = table[:, 5] * table[:, 2] if of_sift else table[:, 5]
+    return Detection(table[:, :2], table[:, 2], response, describe)
 
 
 def _laplacian_sign(grey: Grey, points: FloatArray, size: FloatArray) -> NDArray[np.int8]:
@@ -97,35 +99,19 @@ def _table(keypoints: Sequence[cv2.KeyPoint], *names: str) -> FloatArray:
 def create_detector(options: FeatureOptions) -> Any:
     """Make the OpenCV detector of a kind of features."""
     try:
-        return _CREATORS[options.kind](options)
+        if options.kind == "orb":
+            # Many more than wanted, because ORB keeps the strongest of the whole image and we spread them.
+            return cv2.ORB.create(nfeatures=8 * options.limits[0], fastThreshold=_ORB_FAST_THRESHOLD)
+        if options.kind == "akaze":
+            # OpenCV 5 moved it to xfeatures2d.
+            namespace: Any = cv2 if hasattr(cv2, "AKAZE_create") else cv2.xfeatures2d
+            return namespace.AKAZE_create(threshold=_AKAZE_THRESHOLD)
+        # Without the precise upscale all points are a quarter of a pixel off.
+        return cv2.SIFT.create(nfeatures=0, contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
     except (AttributeError, cv2.error) as error:
         raise ArgumentError(
             f"features {options.kind!r} are not in this OpenCV ({cv2.__version__}); choose others"
         ) from error
-
-
-def _sift(options: FeatureOptions) -> Any:
-    # Without the precise upscale all points are a quarter of a pixel off.
-    return cv2.SIFT.create(nfeatures=0, contrastThreshold=SIFT_CONTRAST, enable_precise_upscale=True)
-
-
-def _orb(options: FeatureOptions) -> Any:
-    # Many more than wanted, because ORB keeps the strongest of the whole image and we spread them.
-    return cv2.ORB.create(nfeatures=8 * options.limits[0], fastThreshold=_ORB_FAST_THRESHOLD)
-
-
-def _akaze(options: FeatureOptions) -> Any:
-    # OpenCV 5 moved it to xfeatures2d.
-    namespace: Any = cv2 if hasattr(cv2, "AKAZE_create") else cv2.xfeatures2d
-    return namespace.AKAZE_create(threshold=_AKAZE_THRESHOLD)
-
-
-_CREATORS: dict[FeatureName, Callable[[FeatureOptions], Any]] = {
-    "sift": _sift,
-    "rootsift": _sift,
-    "orb": _orb,
-    "akaze": _akaze,
-}
 
 
 def to_rootsift(descriptors: Descriptors) -> NDArray[np.float32]:
@@ -135,8 +121,7 @@ def to_rootsift(descriptors: Descriptors) -> NDArray[np.float32]:
     """
     values = descriptors.astype(np.float32)
     total = np.maximum(values.sum(axis=1, keepdims=True), np.float32(1.0))
-    rooted: NDArray[np.float32] = np.rint(np.sqrt(values / total) * np.float32(_ROOTSIFT_NORM))
-    return rooted
+    return np.asarray(np.rint(np.sqrt(values / total) * np.float32(_ROOTSIFT_NORM)))
 
 
 def _strength(response: FloatArray, size: FloatArray, *, of_sift: bool) -> FloatArray:

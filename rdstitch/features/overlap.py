@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.features.keypoints import Correspondences, Features
 from rdstitch.features.match import Matcher
+from rdstitch.system.late_imports import spatial
 
 _MIN_MATCHES = 50  # that an overlap takes
 _MAX_MATCHES = 300  # that are used
@@ -32,7 +33,8 @@ def overlapping(features1: Features, features2: Features, matches: Correspondenc
     if len(matches) < _MIN_MATCHES or size1 is None or size2 is None:
         return None
     points1, points2 = matches.points1[:_MAX_MATCHES], matches.points2[:_MAX_MATCHES]
-    distances = np.maximum(_squared_distances(points1, size1), _squared_distances(points2, size2))
+    places = points1 / np.hypot(*size1), points2 / np.hypot(*size2)
+    distances = np.maximum(*(spatial.distance.cdist(each, each, "sqeuclidean") for each in places))
     # Each is the first of its own neighbours.
     farthest = np.sqrt(np.partition(distances, _SUPPORTING_NEIGHBOURS, axis=1)[:, _SUPPORTING_NEIGHBOURS])
     right = farthest <= _NEIGHBOURHOOD
@@ -63,9 +65,3 @@ def _around(features: Features, size: tuple[int, int], points: FloatArray, reach
     covered = (down[:, None] + across < reach**2).any(axis=-1)
     column, row = np.clip(features.points / size * _CELLS, 0, _CELLS - 1).astype(np.intp).T
     return np.flatnonzero(covered[row, column])
-
-
-def _squared_distances(points: FloatArray, size: tuple[int, int]) -> FloatArray:
-    """Between all points (N, 2), squared diagonals of the image, (N, N)."""
-    x, y = (points / np.hypot(*size)).T
-    return np.asarray(np.subtract.outer(x, x) ** 2 + np.subtract.outer(y, y) ** 2, dtype=np.float64)

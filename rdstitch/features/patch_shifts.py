@@ -22,8 +22,7 @@ def edges_of(pixels: NDArray[Any]) -> Edges:
     steep = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
     # The few strongest edges shall not outweigh all others.
     level = float(np.median(steep)) or float(steep.mean()) or 1.0
-    compressed: Edges = np.log1p(steep / level).astype(np.float32)
-    return compressed
+    return np.log1p(steep / level).astype(np.float32)
 
 
 def _shift(first: Edges, second: Edges) -> FloatArray:
@@ -38,8 +37,7 @@ def coarse_shift(first: Edges, second: Edges) -> FloatArray:
     factor = min(1.0, _COARSE_SIDE / max(first.shape))
     size = round(first.shape[1] * factor), round(first.shape[0] * factor)
     small = [cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (first, second)]
-    moved: FloatArray = _shift(small[0].astype(np.float32), small[1].astype(np.float32)) / factor
-    return moved
+    return np.asarray(_shift(small[0].astype(np.float32), small[1].astype(np.float32)) / factor)
 
 
 def patch_shifts(first: Edges, second: Edges, expected: Callable[[FloatArray], FloatArray]) -> FloatArray:

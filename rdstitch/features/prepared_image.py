@@ -183,5 +183,4 @@ def _eight_bits(grey: PixelArray, usable: NDArray[np.bool_] | None, stretch: Str
     low, high = stretch
     finite = np.where(np.isfinite(grey), grey, low)
     scaled = (finite - low) * (255.0 / max(high - low, 1e-12))
-    eight: NDArray[np.uint8] = np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
-    return eight
+    return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)

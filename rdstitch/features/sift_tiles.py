@@ -6,7 +6,7 @@ ones are those of the image at half its size, and so on.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import TypeVar
 
@@ -79,36 +79,17 @@ def _parts(grey: Grey, options: FeatureOptions) -> Iterator[Detection]:
 
 def _tiles(grey: Grey, factor: FloatArray, octaves: list[int], options: FeatureOptions) -> Iterator[Detection]:
     """Find the keypoints of some octaves, tile by tile."""
-    for y in _intervals(grey.shape[0]):
-        for x in _intervals(grey.shape[1]):
-            detection = detect_opencv(grey[y.seen, x.seen], options, octaves)
-            inside = x.owns(detection.points[:, 0]) & y.owns(detection.points[:, 1])
-            yield _in_whole(detection.take(np.flatnonzero(inside)), np.array([x.seen.start, y.seen.start]), factor)
+    for y, top, bottom in _intervals(grey.shape[0]):
+        for x, left, right in _intervals(grey.shape[1]):
+            detection, corner = detect_opencv(grey[y, x], options, octaves), np.array([x.start, y.start])
+            places = detection.points + corner
+            inside = ((places >= (left, top)) & (places < (right, bottom))).all(axis=1)
+            yield _in_whole(detection.take(np.flatnonzero(inside)), corner, factor)
 
 
-@dataclass(frozen=True)
-class _Interval:
-    """The range of a side of the image that a tile covers, and the part it keeps: infinite at the image's border."""
-
-    seen: slice
-    start: float
-    stop: float
-
-    def owns(self, places: FloatArray) -> NDArray[np.bool_]:
-        """Test that places, pixels of the tile, are in the part that it keeps."""
-        places = places + self.seen.start
-        inside: NDArray[np.bool_] = (places >= self.start) & (places < self.stop)
-        return inside
-
-
-def _intervals(length: int) -> list[_Interval]:
-    """The tiles along a side."""
+def _intervals(length: int) -> list[tuple[slice, float, float]]:
+    """What each tile along a side covers, and from where to where it keeps its keypoints: all beyond the border."""
     borders = np.linspace(0, length, -(-length // _SIDE) + 1).astype(int).tolist()
-    return [
-        _Interval(
-            slice(max(0, start - _OVERLAP), min(length, stop + _OVERLAP)),
-            start if start > 0 else -np.inf,
-            stop if stop < length else np.inf,
-        )
-        for start, stop in pairwise(borders)
-    ]
+    covered = [slice(max(0, a - _OVERLAP), min(length, b + _OVERLAP)) for a, b in pairwise(borders)]
+    edges = [-np.inf, *borders[1:-1], np.inf]
+    return list(zip(covered, edges[:-1], edges[1:], strict=True))

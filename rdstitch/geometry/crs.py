@@ -76,7 +76,11 @@ class Crs:
 
     @property
     def _zone(self) -> int:
-        return _zone_of_epsg(self.epsg)
+        """The zone that the code stands for; 0 of other systems."""
+        for first, sign in ((_NORTH, 1), (_SOUTH, -1)):
+            if 1 <= self.epsg - first <= _POLAR:
+                return sign * (self.epsg - first)
+        return 0
 
     @classmethod
     def in_metres(cls, epsg: int) -> "Crs | None":
@@ -190,14 +194,6 @@ def epsg_of(zone: int) -> int:
     return (_NORTH if zone > 0 else _SOUTH) + abs(zone)
 
 
-def _zone_of_epsg(epsg: int) -> int:
-    """The zone that a code stands for; 0 of other systems."""
-    for first, sign in ((_NORTH, 1), (_SOUTH, -1)):
-        if 1 <= epsg - first <= _POLAR:
-            return sign * (epsg - first)
-    return 0
-
-
 def _utm(latitude: ArrayLike, longitude: ArrayLike, zone: int) -> FloatArray:
     """UTM coordinates (N, 2) on WGS 84, m: easting and northing, of degrees (N,); the zone is negative in the south.
 
@@ -248,8 +244,7 @@ def _latitude(conformal: FloatArray) -> FloatArray:
     """Latitudes of conformal ones, radians."""
     n = _THIRD_FLATTENING
     series = (2 * n - 2 * n**2 / 3 - 2 * n**3, 7 * n**2 / 3 - 8 * n**3 / 5, 56 * n**3 / 15)
-    phi: FloatArray = conformal + sum(factor * np.sin(2 * k * conformal) for k, factor in enumerate(series, start=1))
-    return phi
+    return conformal + sum(factor * np.sin(2 * k * conformal) for k, factor in enumerate(series, start=1))
 
 
 def _central_meridian(zone: int) -> float:

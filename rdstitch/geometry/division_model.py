@@ -30,8 +30,7 @@ OBSERVABLE_STD = 0.1
 
 _NEWTON_STEPS = 40
 _NEWTON_TOLERANCE = 1e-14
-_QUICK_STEPS = 8  # steps of Newton's method alone
-_QUICK_TOLERANCE = 1e-9  # last step of it: the error left is its square
+_STEP_TOLERANCE = 1e-9  # last step of it: the error left is its square
 _RATIO_STEPS = 12
 _FARTHEST = 4.0
 """Half diagonals: with more coefficients than λ the model is not used beyond, where only the highest power counts."""
@@ -45,14 +44,12 @@ _NEAREST_TOLERANCE = 1e-13
 def divisor(radius2: FloatArray, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
     """``g`` at squared radii of measured points; λ broadcasts, ``higher`` are μ and ν."""
     tail = horner(higher, radius2)
-    result: FloatArray = 1.0 + (np.asarray(distortion) + tail) * radius2
-    return result
+    return 1.0 + (np.asarray(distortion) + tail) * radius2
 
 
 def divisor_slope(radius2: FloatArray, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
     """Derivative of ``g`` by the squared radius: ``λ + 2 μ q + 3 ν q²``."""
-    result: FloatArray = np.asarray(distortion) + horner([(k + 2) * c for k, c in enumerate(higher)], radius2)
-    return result
+    return np.asarray(distortion) + horner([(k + 2) * c for k, c in enumerate(higher)], radius2)
 
 
 def undistort(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
@@ -202,48 +199,25 @@ def _first_zero(coefficients: FloatArray) -> float:
 def _distorted_radius(radius: FloatArray, distortion: float, higher: tuple[float, ...]) -> FloatArray:
     """Solve ``r = r_u g(r²)`` for the measured radius within the domain; NaN where there is none.
 
-    The domain has one root at most, so that whatever Newton's method reaches there is it; where it leaves the domain or
-    takes its time, bisection guards it.
+    By Newton's method from the root for λ alone. The domain has one root at most: a step that leaves what is left of it
+    is replaced by its middle.
     """
     limit = valid_radius(distortion, higher)
     with np.errstate(all="ignore"):
         solvable = limit - radius * float(divisor(np.asarray(limit**2), distortion, higher)) > 0.0
         discriminant = np.maximum(1.0 - 4.0 * distortion * radius**2, 0.0)
         measured = np.minimum(2.0 * radius / (1.0 + np.sqrt(discriminant)), limit)
-        settled = np.zeros_like(solvable)
-        for _ in range(_QUICK_STEPS):
-            q = measured**2
-            slope = 1.0 - 2.0 * radius * measured * divisor_slope(q, distortion, higher)
-            step = (measured - radius * divisor(q, distortion, higher)) / slope
-            measured = measured - step
-            settled = np.abs(step) <= _QUICK_TOLERANCE * limit
-            if settled.all():
-                break
-    left = solvable & ~(settled & (slope > 0.0) & (measured >= 0.0) & (measured <= limit))
-    if left.any():
-        measured = np.array(measured)
-        measured[left] = _guarded_radius(radius[left], distortion, higher)
-    return np.where(solvable, measured, np.nan)
-
-
-def _guarded_radius(radius: FloatArray, distortion: float, higher: tuple[float, ...]) -> FloatArray:
-    """Undistorted radii (N,) where there is a solution, by Newton's method with bisection."""
-    limit = valid_radius(distortion, higher)
-    with np.errstate(over="ignore", invalid="ignore"):
         low, high = np.zeros_like(radius), np.full_like(radius, limit)
-        measured = (low + high) / 2.0
         for _ in range(_NEWTON_STEPS):
             q = measured**2
             value = measured - radius * divisor(q, distortion, higher)
             low, high = np.where(value > 0.0, low, measured), np.where(value > 0.0, measured, high)
-            slope = 1.0 - 2.0 * radius * measured * divisor_slope(q, distortion, higher)
-            following = measured - value / np.where(slope > 0.0, slope, np.nan)
+            following = measured - value / (1.0 - 2.0 * radius * measured * divisor_slope(q, distortion, higher))
             following = np.where((following >= low) & (following <= high), following, (low + high) / 2.0)
-            step = np.abs(following - measured)
-            measured = following
-            if not (step > _NEWTON_TOLERANCE * limit).any():
+            step, measured = np.abs(following - measured), following
+            if not (solvable & (step > _STEP_TOLERANCE * limit)).any():
                 break
-    return measured
+    return np.where(solvable, measured, np.nan)
 
 
 def is_one_to_one(radius: float, distortion: float, higher: Sequence[float] = ()) -> bool:

@@ -24,35 +24,24 @@ def nearest_rotation(matrices: FloatArray) -> FloatArray:
     """Rotations (..., 3, 3) nearest to matrices, up to a positive scale (orthogonal Procrustes, Kabsch)."""
     left, _, right = np.linalg.svd(matrices)
     left[..., 2] *= np.sign(np.linalg.det(left @ right))[..., None]
-    rotation: FloatArray = left @ right
-    return rotation
+    return np.asarray(left @ right)
 
 
-def rotation_about(vectors: FloatArray, angles: FloatArray) -> FloatArray:
-    """Rotations (N, 3, 3) about vectors (N, 3) by angles (N,), their lengths, radians (Rodrigues)."""
-    cross = np.einsum("nk,kij->nij", vectors, np.stack([ABOUT_X, ABOUT_Y, ABOUT_Z]))
-    first = np.sinc(angles / np.pi)[:, None, None]
-    second = 0.5 * np.sinc(angles / (2.0 * np.pi))[:, None, None] ** 2
-    rotation: FloatArray = np.eye(3) + first * cross + second * (cross @ cross)
-    return rotation
+def rotation_about(vectors: ArrayLike) -> FloatArray:
+    """Rotations (..., 3, 3) about vectors (..., 3) by their lengths, radians (Rodrigues)."""
+    about = np.asarray(vectors, dtype=np.float64)
+    angles = np.linalg.norm(about, axis=-1)[..., None, None]
+    cross = np.einsum("...k,kij->...ij", about, np.stack([ABOUT_X, ABOUT_Y, ABOUT_Z]))
+    first, second = np.sinc(angles / np.pi), 0.5 * np.sinc(angles / (2.0 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
 
 
 def rotation_from_tilt(tilt: ArrayLike) -> FloatArray:
     """``R = Rx(ψ) Ry(θ)`` for tilts (ψ, θ) of shape (..., 2), radians; shape (..., 3, 3)."""
     angles = np.asarray(tilt, dtype=np.float64)
-    sine, cosine = np.sin(angles), np.cos(angles)
-    sin_x, sin_y = sine[..., 0], sine[..., 1]
-    cos_x, cos_y = cosine[..., 0], cosine[..., 1]
-    rotation = np.zeros((*angles.shape[:-1], 3, 3))
-    rotation[..., 0, 0] = cos_y
-    rotation[..., 0, 2] = sin_y
-    rotation[..., 1, 0] = sin_x * sin_y
-    rotation[..., 1, 1] = cos_x
-    rotation[..., 1, 2] = -sin_x * cos_y
-    rotation[..., 2, 0] = -cos_x * sin_y
-    rotation[..., 2, 1] = sin_x
-    rotation[..., 2, 2] = cos_x * cos_y
-    return rotation
+    (sx, sy), (cx, cy) = (np.moveaxis(of(angles), -1, 0) for of in (np.sin, np.cos))
+    rows = (cy, np.zeros_like(cy), sy), (sx * sy, cx, -sx * cy), (-cx * sy, sx, cx * cy)
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def tilt_from_normal(normal: ArrayLike) -> FloatArray:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rdstitch.arrays import BoolArray, FloatArray
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.division_model import distort, divisor, divisor_slope, measured_ratio
+from rdstitch.geometry.division_model import divisor, divisor_slope, measured_ratio
 from rdstitch.geometry.planar_motion import PlanarMotion
 
 
@@ -38,13 +38,6 @@ def are_homographies(matrices: FloatArray) -> BoolArray:
     with np.errstate(all="ignore"):
         unit = matrices / np.sqrt(np.einsum("nij,nij->n", matrices, matrices))[:, None, None]
         return np.asarray(np.linalg.det(unit) > _MIN_DETERMINANT)
-
-
-def lift(points: ArrayLike, distortion: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
-    """``(x, y, 1 + λ r² + μ r⁴ + ν r⁶)`` of normalized points (..., 2); shape (..., 3). λ broadcasts."""
-    x = np.asarray(points, dtype=np.float64)
-    third = divisor(np.einsum("...i,...i->...", x, x), distortion, higher)
-    return np.concatenate([np.broadcast_to(x, (*third.shape, 2)), third[..., None]], axis=-1)
 
 
 def project(homogeneous: FloatArray) -> FloatArray:
@@ -74,8 +67,7 @@ def to_directions(camera: Camera, matrix: FloatArray, points: ArrayLike) -> Floa
     ``matrix`` (3, 3) leads from undistorted normalized coordinates to directions.
     """
     flat = camera.normalize(camera.undistort(points))
-    directions: FloatArray = np.concatenate([flat, np.ones((len(flat), 1))], axis=1) @ matrix.T
-    return directions
+    return np.concatenate([flat, np.ones((len(flat), 1))], axis=1) @ matrix.T
 
 
 def from_directions(camera: Camera, matrix: FloatArray, directions: FloatArray) -> FloatArray:
@@ -88,19 +80,14 @@ def _mapped(homography: FloatArray, points: FloatArray) -> FloatArray:
     return project(points @ homography[:, :2].T + homography[:, 2])
 
 
-def transfer(
-    homography: ArrayLike, distortion: ArrayLike, points: ArrayLike, higher: Sequence[float] = ()
-) -> FloatArray:
+def transfer(homography: FloatArray, distortion: float, points: ArrayLike, higher: Sequence[float] = ()) -> FloatArray:
     """Where measured points of image 1 are measured in image 2: undistort, apply H, distort.
 
-    Of homographies (..., 3, 3), from image 1 to image 2 with positive third coordinates in front of the camera, λ
-    (...) in the frame of the points, and normalized points (N, 2): (..., N, 2), NaN for a point that comes to lie
-    behind the camera or beyond the lens model. ``higher`` are μ and ν, where λ is one number.
+    By a homography (3, 3) from image 1 to image 2, with positive third coordinates in front of the camera, and λ in the
+    frame of the points: of normalized points (N, 2), NaN for a point that comes to lie behind the camera or beyond the
+    lens model. ``higher`` are μ and ν.
     """
-    h = np.asarray(homography, dtype=np.float64)
-    lam = np.asarray(distortion, dtype=np.float64)[..., None]
-    lifted = lift(np.asarray(points, dtype=np.float64), lam, higher)
-    return distort(project(lifted @ np.swapaxes(h, -2, -1)), lam, higher)
+    return transfer_points(homography, distortion, np.asarray(points, dtype=np.float64).T, higher)[2].T
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,8 +106,7 @@ class TransferJacobian:
     @property
     def by_homography(self) -> FloatArray:
         """Derivatives by the entries of H, row by row, shape (N, 2, 9)."""
-        entries: FloatArray = self.by_image[:, :, None] * self.lifted
-        return entries.reshape(2, 9, -1).transpose(2, 0, 1)
+        return (self.by_image[:, :, None] * self.lifted).reshape(2, 9, -1).transpose(2, 0, 1)
 
     def by_lens(self, free: BoolArray) -> FloatArray:
         """Derivatives (2, K, N) by those of :data:`rdstitch.geometry.camera.LENS_PARAMETERS` that are ``free`` (5,).

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -116,11 +116,11 @@ def align_locally(
     if ground is not None:
         limit = math.inf
     candidates = list(_candidates(fitted, tested, images, min(coarse, cells), cells, base))
-    costs = [_seam_residual(candidate.residual) for candidate in candidates]
+    costs = [_seam_residual(left) for _, left in candidates]
     if min(costs) <= limit:
-        costs = [cost + _bend(one.fields, straight()) for cost, one in zip(costs, candidates, strict=True)]
-    best = candidates[int(np.argmin(costs))]
-    before, after = HeldOut.of(tested.residual), HeldOut.of(best.residual)
+        costs = [cost + _bend(fit.delivered, straight()) for cost, (fit, _) in zip(costs, candidates, strict=True)]
+    best, left = candidates[int(np.argmin(costs))]
+    before, after = HeldOut.of(tested.residual), HeldOut.of(left)
     text = (
         f"matches that decided, held out of the fit: {before.median:.2f} pixels apart without, {after.median:.2f} with"
     )
@@ -130,7 +130,7 @@ def align_locally(
         text += ", mostly by the height of the ground"
     if choice not in ("auto", cells):
         text += f"; a grid of {cells} instead of {choice} cells, the finest that so many images may have"
-    final = fit_fields(placed, images, best.fit.stiffness, best.fit, ground)
+    final = fit_fields(placed, images, best.stiffness, best, ground)
     return LocalAlignment(final.delivered, text, cells, ground is not None, before, after)
 
 
@@ -161,12 +161,6 @@ def _ground(matches: PlacedMatches, images: ImagesOnSurface, centers: FloatArray
     return fit_ground(matches, images, images.scale * centers, stiffness).fields(images, stiffness)
 
 
-class _Candidate(NamedTuple):
-    fit: PlacedFields
-    fields: tuple[DisplacementField, ...]  # as they would be delivered
-    residual: FloatArray  # (M, D): what these leave of held-out matches, pixels of the median image
-
-
 def _candidates(
     fitted: PlacedMatches,
     tested: PlacedMatches,
@@ -174,13 +168,16 @@ def _candidates(
     coarse: int,
     cells: int,
     base: PlacedFields | None = None,
-) -> Iterator[_Candidate]:
-    """Fields of each slope on top of others; without, the freest on a coarse grid finds what is far off the plane."""
+) -> Iterator[tuple[PlacedFields, FloatArray]]:
+    """Fields of each slope on top of others; without, the freest on a coarse grid finds what is far off the plane.
+
+    Each with what it leaves of held-out matches as it would be delivered, (M, D), pixels of the median image.
+    """
     fit = base or fit_fields(fitted, images, Stiffness(coarse, _SLOPES[0]))
     for slope in _SLOPES:
         if base or fit.stiffness != Stiffness(cells, slope):
             fit = fit_fields(fitted, images, Stiffness(cells, slope), fit, base)
-        yield _Candidate(fit, fit.delivered, tested.residual_with(fit.delivered, images))
+        yield fit, tested.residual_with(fit.delivered, images)
 
 
 def _agreement_of_neighbours(matches: PlacedMatches) -> float:

@@ -226,14 +226,9 @@ def smoothness(shape: tuple[int, ...], spacing: float, slope: float, image_side:
     """Precision of the nodes of a grid, for residuals in units of their robust scale: a membrane and a thin plate."""
     rows, columns = shape
     total: Any = sparse.eye_array(rows * columns) * (spacing / (_FADE * image_side)) ** 2
-    for order in (1, 2):
-        steps = [_differences(n, order) for n in (rows, columns)]
+    for weights in ([-1.0, 1.0], [1.0, -2.0, 1.0]):  # first and second differences
+        order = len(weights) - 1
+        steps = [sparse.diags_array(weights, offsets=range(order + 1), shape=(n - order, n)) for n in (rows, columns)]
         for both in (sparse.kron(steps[0], sparse.eye_array(columns)), sparse.kron(sparse.eye_array(rows), steps[1])):
             total = total + both.T @ both
     return sparse.csr_array(total / (slope * spacing) ** 2)
-
-
-def _differences(count: int, order: int) -> Any:
-    """First or second differences of ``count`` values."""
-    weights = {1: [-1.0, 1.0], 2: [1.0, -2.0, 1.0]}[order]
-    return sparse.diags_array(weights, offsets=list(range(order + 1)), shape=(count - order, count))

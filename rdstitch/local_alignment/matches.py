@@ -82,9 +82,6 @@ class PlacedMatches(Rows):
     places: FloatArray  # (M, 2, D): where the alignment puts either
     scale: FloatArray  # (M,): half the diagonal of the first image, pixels
 
-    def __len__(self) -> int:
-        return len(self.images)
-
     @classmethod
     def join(cls, parts: Iterable[Self]) -> Self:
         """All of them, one after the other."""

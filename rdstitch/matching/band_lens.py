@@ -99,8 +99,7 @@ def _fit(camera: Camera, shifts: Sequence[FloatArray]) -> BandLens | None:
         return _seen_by_band(camera, homography, float(parameters[8]), points)
 
     def residuals(parameters: FloatArray) -> FloatArray:
-        off: FloatArray = np.nan_to_num(seen(parameters) - others, nan=1e3).ravel()
-        return off
+        return np.asarray(np.nan_to_num(seen(parameters) - others, nan=1e3).ravel())
 
     result = optimize.least_squares(residuals, start, loss="cauchy", f_scale=near / 3.0, x_scale=0.01, max_nfev=50)
     off = np.linalg.norm(result.fun.reshape(-1, 2), axis=1)

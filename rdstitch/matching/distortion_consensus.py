@@ -49,13 +49,9 @@ def vote(distortion: ArrayLike, std: ArrayLike) -> Consensus:
         if rounds == _ROUNDS or not inside.any():
             break
         center = float(weight @ values / weight.sum())
-        scatter = _scatter(values - center, errors)
+        if len(values) == 2:  # neither is nearer to the truth: by their difference alone
+            unexplained = (np.diff(values)[0] ** 2 - errors @ errors) / 2.0
+        else:  # where the median of some ratios of squares is a number, that of the differences times it is zero
+            unexplained = np.median(((values - center) / NORMAL_MEDIAN) ** 2 - errors**2)
+        scatter = float(np.sqrt(max(unexplained, 0.0)))
     return Consensus(center, float(1.0 / np.sqrt(max(weight.sum(), 1e-300))), scatter, values, total, inside)
-
-
-def _scatter(residual: FloatArray, errors: FloatArray) -> float:
-    """The additional standard deviation that makes the median of the normalized residuals what it should be."""
-    if len(residual) == 2:  # neither is nearer to the truth: by their difference alone
-        return float(np.sqrt(max(np.diff(residual)[0] ** 2 - errors @ errors, 0.0) / 2.0))
-    # Where the median of some ratios of squares is a number, that of the differences times it is zero.
-    return float(np.sqrt(max(np.median((residual / NORMAL_MEDIAN) ** 2 - errors**2), 0.0)))

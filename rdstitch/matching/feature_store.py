@@ -48,9 +48,14 @@ class StoredFeatures:
         """Read the features; InputError when they have vanished."""
         packed = self.stored.load()
         features = (packed if self.chosen is None else packed.take(self.chosen)).unpack()
-        if self.image_size is None or features.image_size in (None, self.image_size):
+        before, size = features.image_size, self.image_size
+        if before is None or size is None or before == size:
             return features
-        return _at_size(features, self.image_size)
+        points, scale = (
+            _rescaled(features.points, before, size),
+            features.scale * (Camera(size).scale / Camera(before).scale),
+        )
+        return replace(features, points=points, scale=scale, image_size=size)
 
     def take(self, index: NDArray[np.intp]) -> Self:
         """The features of the images of these indices."""
@@ -136,16 +141,6 @@ class StoredMatches:
     def key(self, cache: Cache) -> str:
         """What stands for them in the inputs of later results; empty without a cache."""
         return cache.digest((self.stored.key, self.sizes))
-
-
-def _at_size(features: Features, size: Size) -> Features:
-    """Features in pixels of the image at another size."""
-    before = features.image_size
-    assert before is not None
-    factor = Camera(size).scale / Camera(before).scale
-    return replace(
-        features, points=_rescaled(features.points, before, size), scale=features.scale * factor, image_size=size
-    )
 
 
 def _rescaled(points: FloatArray, before: Size, after: Size) -> FloatArray:

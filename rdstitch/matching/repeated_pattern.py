@@ -113,7 +113,7 @@ def match_pattern(features1: Features, features2: Features) -> Correspondences:
         return nothing
     half = float(np.hypot(*(features1.image_size or np.ptp(features1.points, axis=0)))) / 2.0
     keypoint, partner, distance = _partners(features1, features2)
-    z1, z2 = (_complex(f.points)[index] / half for f, index in ((features1, keypoint), (features2, partner)))
+    z1, z2 = (f.points[of] @ np.array([1.0, 1.0j]) / half for f, of in ((features1, keypoint), (features2, partner)))
     turn = features2.angle[partner] - features1.angle[keypoint]
     motion = features2.scale[partner] / features1.scale[keypoint] * np.exp(1j * turn)
     likely = np.argsort(distance, kind="stable")[: len(distance) // 2]
@@ -155,10 +155,6 @@ def _partners(features1: Features, features2: Features) -> tuple[IntArray, IntAr
     return keypoint[kept], partner[kept], distance[kept]
 
 
-def _complex(points: FloatArray) -> NDArray[np.complex128]:
-    return np.asarray(points[:, 0] + 1j * points[:, 1], dtype=np.complex128)
-
-
 def _agreeing(
     z1: NDArray[np.complex128], z2: NDArray[np.complex128], motion: NDArray[np.complex128], index: int
 ) -> BoolArray:
@@ -167,8 +163,7 @@ def _agreeing(
     tolerance = np.minimum(_NEAR + _SPREAD * np.abs(expected - z2[index]), _FAR)
     relative = np.log(motion / motion[index])
     near = np.abs(expected - z2) < tolerance
-    agreeing: BoolArray = near & (np.abs(relative.real) < _LOG_SCALE) & (np.abs(relative.imag) < _TURN)
-    return agreeing
+    return np.asarray(near & (np.abs(relative.real) < _LOG_SCALE) & (np.abs(relative.imag) < _TURN))
 
 
 def _refined(

@@ -77,8 +77,6 @@ class Vocabulary:
     def assign(self, descriptors: Array32) -> NDArray[np.int32]:
         """The word of each descriptor, shape (M,)."""
         word = np.empty(len(descriptors), dtype=np.int32)
-        if not len(descriptors):
-            return word
         branch = _nearest(descriptors, self.branches)
         order = np.argsort(branch, kind="stable")
         edges = np.searchsorted(branch[order], np.arange(len(self.branches) + 1))

@@ -56,9 +56,9 @@ class PairMatches:
         if self.quality is not None and np.isnan(self.quality).any():
             raise ArgumentError("quality has values that are NaN")
         if self.tilts is not None and self.tilts.shape != (2, 2):
-            raise ArgumentError(f"tilts must have shape (2, 2), not {self.tilts.shape}")
+            raise ArgumentError(f"tilt must be (psi, theta) or one such pair an image, not of shape {self.tilts.shape}")
         if self.tilts is not None and not (np.abs(self.tilts) < np.pi / 2.0).all():
-            raise ArgumentError("tilts must be below a right angle, in radians")
+            raise ArgumentError("tilt must be below a right angle, in radians")
 
     def __len__(self) -> int:
         """Number of matches."""
@@ -172,7 +172,10 @@ def estimate_radial_homography(
     options = EstimationOptions(solver, threshold, confidence, max_iterations, seed, distortion)
     p1, p2 = checked_matches(points1, points2)
     weights = None if quality is None else as_numbers("quality", quality)
-    pair = PairMatches(p1, p2, camera1, camera1.resized(size2), weights, _tilts(tilt))
+    tilts = None if tilt is None else as_numbers("tilt", tilt)
+    if tilts is not None and tilts.shape == (2,):
+        tilts = np.broadcast_to(tilts, (2, 2))
+    pair = PairMatches(p1, p2, camera1, camera1.resized(size2), weights, tilts)
     return estimate_radial_homographies([pair], options)[0]
 
 
@@ -225,13 +228,10 @@ def _estimate_batch(pairs: list[PairMatches], options: EstimationOptions) -> lis
 def _selected(
     pair: PairMatches, best: Hypotheses, data: Measurements, tilts: FloatArray | None, options: EstimationOptions
 ) -> dict[int, PairFit]:
-    """The model of each pair, by its row, that has a hypothesis; ``pair`` is any of the batch.
-
-    Pairs with many inliers keep a free homography, where the options say so.
-    """
+    """The model of each pair, by its row, that has a hypothesis; ``pair`` is any of the batch."""
     solved = np.flatnonzero(np.isfinite(best.cost))
-    limit = np.inf if options.select_below is None else options.select_below
-    few = best.inliers[solved].sum(axis=1) < limit
+    # Pairs with many inliers keep a free homography, where the options say so.
+    few = best.inliers[solved].sum(axis=1) < (np.inf if options.select_below is None else options.select_below)
     selection = ModelSelection(options.threshold, options.distortion is not None)
     pairs = StartedPairs(data, best.homography, best.distortion, tilts)
     prior = pair.focal_prior
@@ -242,16 +242,6 @@ def _selected(
             selected = selection.select(models, pairs.take(solved[rows]))
             fits.update(zip(solved[rows].tolist(), selected, strict=True))
     return fits
-
-
-def _tilts(tilt: ArrayLike | None) -> FloatArray | None:
-    """Tilts (2, 2) of both images, checked; None where they are not known."""
-    if tilt is None:
-        return None
-    angles = as_numbers("tilt", tilt)
-    if angles.shape not in ((2,), (2, 2)) or not np.isfinite(angles).all():
-        raise ArgumentError(f"tilt must be (psi, theta) or one such pair an image, finite, not {tilt!r}")
-    return np.broadcast_to(angles, (2, 2))
 
 
 def _solvers(options: EstimationOptions, focal: float, prior: Prior, tilts_known: bool) -> list[MinimalSolver]:

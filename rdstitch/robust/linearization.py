@@ -14,7 +14,6 @@ import numpy as np
 from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 from rdstitch.geometry.division_model import distorted_ratio
 from rdstitch.numerics.robust_loss import loss_ratio, robust_weight
-from rdstitch.robust.levenberg_marquardt import BatchedNormalEquations
 from rdstitch.robust.measurements import Measurements
 
 _PAIRS = np.triu_indices(3)  # entries of a symmetric matrix of 3 x 3 that determine it
@@ -175,8 +174,8 @@ def _precision(at: _Transfer, by_point: FloatArray, data: Measurements) -> Float
 
 def entry_equations(
     transferred: TransferDerivatives, present: BoolArray, scale: FloatArray, free_lens: bool
-) -> BatchedNormalEquations:
-    """The loss with its scale ``c`` (B,), pixels, and its normal equations by the entries of H, then by the lens."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The loss (B,) of a scale (B,), pixels, its normal matrix and its gradient, by the entries of H, then the lens."""
     useless = transferred.lost | ~present
     relative = loss_ratio(transferred.squared, scale[:, None])
     relative[useless] = 0.0
@@ -200,7 +199,7 @@ def entry_equations(
         of_lens = left.reshape(batch, size, 2 * count)[:, :extra] @ flat.swapaxes(1, 2)
         information[:, 9:, 9:] = of_lens[:, :, :extra]
         gradient[:, 9:] = of_lens[:, :, extra]
-    return BatchedNormalEquations(cost, information, gradient, np.where(useless, np.inf, transferred.squared))
+    return cost, information, gradient
 
 
 def influence(transferred: TransferDerivatives, present: BoolArray, scale: FloatArray, free_lens: bool) -> FloatArray:

@@ -48,10 +48,6 @@ class Measurements(Rows):
         """Check and normalize the matches of one pair, pixels (N, 2)."""
         return cls.of_pairs([checked_matches(points1, points2)], [(camera1, camera2)])
 
-    def __len__(self) -> int:
-        """Number of pairs."""
-        return len(self.count)
-
     @cached_property
     def radius2(self) -> FloatArray:
         """Squared distance of the points of image 1 from the distortion centre, (B, N)."""

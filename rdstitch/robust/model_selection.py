@@ -13,7 +13,7 @@ from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.robust.posterior import Evidence, farthest_error
 from rdstitch.robust.priors import LENS_PRIORS, prior_costs
-from rdstitch.robust.refinement import PairEquations, PairProblems, refine_pairs
+from rdstitch.robust.refinement import PairEquations, PairProblems, descend
 
 _STEPS = 20  # of refinement; halved or doubled, the median error of λ changes by a sixth at most
 
@@ -86,7 +86,10 @@ class ModelSelection:
         rms = np.stack([rms_of(each.equations.errors, self.threshold) for each in fitted], axis=1)
 
         def finished(index: int, rows: IntArray, why: str) -> dict[int, PairFit]:
-            reasons = [_explained(fitted, index, rms[k], why) for k in rows]
+            errors = (
+                ", ".join(f"{one.name} {e:.2f} pixels" for one, e in zip(fitted, rms[k], strict=True)) for k in rows
+            )
+            reasons = [f"{fitted[index].name}: {why} (rms {listed})" for listed in errors]
             selected, parameters = fitted[index].start(pairs).take(rows), fitted[index].parameters[rows]
             # On all matches, with the noise that it leaves itself.
             problems = self._problems(fitted[index].problems.model, selected)
@@ -108,7 +111,8 @@ class ModelSelection:
 
     def _fit(self, model: PairModel, pairs: StartedPairs) -> _Fitted:
         problems = self._problems(model, pairs)
-        return _Fitted(problems, *refine_pairs(problems, pairs.homography, pairs.distortion, pairs.tilts, _STEPS))
+        start = problems.start(pairs.homography, pairs.distortion, pairs.tilts)
+        return _Fitted(problems, *descend(problems, start, _STEPS))
 
     def _cost(self, fitted: _Fitted, evidence: Evidence, row: IntArray, column: IntArray) -> FloatArray:
         """-2 log of the posterior of a model of each pair (B,), by the matches at these places, up to a constant."""
@@ -149,9 +153,3 @@ def rms_of(errors: FloatArray, threshold: float) -> FloatArray:
     count = inside.sum(axis=1)
     total = np.square(np.where(inside, errors, 0.0)).sum(axis=1)
     return np.asarray(np.sqrt(np.where(count > 0, total, np.nan) / np.maximum(count, 1)))
-
-
-def _explained(fitted: list[_Fitted], chosen: int, rms: FloatArray, why: str) -> str:
-    """Which model was chosen and why, with the errors that each leaves."""
-    listed = ", ".join(f"{one.name} {value:.2f} pixels" for one, value in zip(fitted, rms, strict=True))
-    return f"{fitted[chosen].name}: {why} (rms {listed})"

@@ -11,7 +11,6 @@ The state of the planar models is
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -30,36 +29,6 @@ from rdstitch.robust.priors import Prior, prior_costs, prior_slopes
 _TILTS, _YAW, _TX, _TY, _HEIGHT, _FOCAL = slice(0, 4), 4, 5, 6, 7, 8
 _PSI, _THETA = (0, 2), (1, 3)
 _COMPLEMENT = np.eye(9)[:, 1:]
-
-
-class PairModel(Protocol):
-    """A parametrisation of the homographies between two images, in the half-diagonal frame, of B pairs at once."""
-
-    @property
-    def name(self) -> str:
-        """Name of the model in the family."""
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the P entries of a step."""
-
-    def initialize(self, homography: FloatArray, tilts: FloatArray | None = None) -> FloatArray:
-        """States (B, 9) nearest to homographies (B, 3, 3), for known tilts (B, 2, 2), radians."""
-
-    def homography(self, state: FloatArray) -> FloatArray:
-        """Homographies (B, 3, 3)."""
-
-    def jacobian(self, state: FloatArray) -> FloatArray:
-        """Derivatives of the homographies by a step, shape (B, 9, P)."""
-
-    def retract(self, state: FloatArray, step: FloatArray) -> FloatArray:
-        """States (B, 9) after steps (B, P)."""
-
-    def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Cost (B,) of the states by a prior, and its slope and curvature by a step (B, P)."""
-
-    def motion(self, state: FloatArray) -> PlanarMotion | None:
-        """The planar motion of one state (9,), if the model is one."""
 
 
 @dataclass(frozen=True)
@@ -109,26 +78,24 @@ class PlanarPairModel:
     height_free: bool = False  # whether the height may change
 
     @cached_property
+    def _free(self) -> dict[str, tuple[int, ...]]:
+        """Which entries of the state each free parameter moves, by its name."""
+        free: dict[str, tuple[int, ...]] = {} if self.tilts_known else {"psi": _PSI, "theta": _THETA}
+        free |= {"yaw": (_YAW,), "tx": (_TX,), "ty": (_TY,)}
+        if self.height_free:
+            free["log_height"] = (_HEIGHT,)
+        # With known tilt, a wrong focal length is hidden in the height of the plane.
+        return free | ({"log_focal": (_FOCAL,)} if self.focal_free else {})
+
+    @cached_property
     def _directions(self) -> FloatArray:
         """Directions in which each free parameter moves the state, (P, 9)."""
-        free: list[tuple[int, ...]] = [] if self.tilts_known else [_PSI, _THETA]
-        free += [(_YAW,), (_TX,), (_TY,)]
-        if self.height_free:
-            free.append((_HEIGHT,))
-        # With known tilt, a wrong focal length is hidden in the height of the plane.
-        if self.focal_free:
-            free.append((_FOCAL,))
-        directions = np.zeros((len(free), 9))
-        for row, entries in zip(directions, free, strict=True):
-            row[[*entries]] = 1.0
-        return directions
+        return np.array([np.isin(np.arange(9), entries) for entries in self._free.values()], dtype=np.float64)
 
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the P entries of a step."""
-        free = () if self.tilts_known else ("psi", "theta")
-        height = ("log_height",) if self.height_free else ()
-        return (*free, "yaw", "tx", "ty", *height, *(("log_focal",) if self.focal_free else ()))
+        return tuple(self._free)
 
     @property
     def focal_free(self) -> bool:
@@ -194,7 +161,7 @@ class PlanarPairModel:
     def prior(self, state: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Prior of a free focal length: its cost (B,), and the slope and curvature by a step (B, P)."""
         slope, curvature = np.zeros((2, len(state), len(self.parameters)))
-        if self.focal_prior is None or self.tilts_known:
+        if self.focal_prior is None or not self.focal_free:
             return slope[:, 0], slope, curvature
         log_focal = math.log(self.focal) + state[:, _FOCAL:]
         slope[:, -1:], curvature[:, -1:] = prior_slopes((self.focal_prior,), log_focal)
@@ -213,3 +180,6 @@ class PlanarPairModel:
 
 
 _IN_PLANE = np.array([1.0, 1.0, 0.0])
+
+PairModel = HomographyPairModel | PlanarPairModel
+"""A parametrisation of the homographies of B pairs at once, in the half-diagonal frame."""

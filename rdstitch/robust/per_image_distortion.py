@@ -13,11 +13,10 @@ import numpy as np
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.numerics.nearest_points import SAME_FEATURE, separate_neighbours
-from rdstitch.robust.levenberg_marquardt import descend
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel
 from rdstitch.robust.priors import LENS_PRIORS, Prior
-from rdstitch.robust.refinement import PairProblems
+from rdstitch.robust.refinement import PairProblems, descend
 
 _HOMOGRAPHY = HomographyPairModel()
 _LENS = (Prior(), Prior(), LENS_PRIORS[1], *LENS_PRIORS[3:])

@@ -29,14 +29,9 @@ from rdstitch.arrays import FloatArray, IntArray
 MODEL_ERROR = 0.1
 """Pixels: how exactly a lens and a plane can be described at all; smaller errors do not tell hypotheses apart."""
 
-_SIDE = 4
-"""Cells along each side of an overlap; blocks have half as many."""
-
-_FARTHEST = 0.02
-"""Half diagonals: errors beyond count as this; a link that is off by less is no wrong pair."""
-
-_SIZES = 14
-"""Sizes of each part of the field that are tried, from :data:`MODEL_ERROR` to the farthest error."""
+_SIDE = 4  # cells along each side of an overlap; blocks have half as many
+_FARTHEST = 0.02  # half diagonals: errors beyond count as this; a link that is off by less is no wrong pair
+_SIZES = 14  # sizes of each part of the field that are tried, from MODEL_ERROR to the farthest error
 
 
 def overlap_cells(link: IntArray, points: FloatArray, count: int, side: int) -> tuple[IntArray, IntArray]:

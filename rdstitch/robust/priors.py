@@ -38,8 +38,7 @@ TWENTY_TO_ONE = 6.0
 
 _EXACT_STD = 1e-6
 
-_MODE_STEPS = 50
-"""From a part of a mixture to the least cost near it."""
+_MODE_STEPS = 50  # from a part of a mixture to the least cost near it
 
 
 @dataclass(frozen=True)
@@ -47,10 +46,6 @@ class Prior:
     """A mixture of normal distributions of one parameter; of none, it says nothing."""
 
     parts: tuple[tuple[float, float, float], ...] = ()  # weight, mean and standard deviation of each, the core first
-
-    def cost(self, value: float) -> float:
-        """-2 log of the density, relative to that of the core alone at its middle."""
-        return float(prior_costs((self,), np.array([value]))[0])
 
     def slope(self, value: float) -> float:
         """Half the derivative of the cost."""
@@ -74,7 +69,7 @@ class Prior:
 
 
 def prior_costs(priors: tuple[Prior, ...], values: FloatArray) -> FloatArray:
-    """The costs of K parameters (..., K)."""
+    """The costs of K parameters (..., K): -2 log of the densities, relative to those of the cores at their middles."""
     return np.asarray(-2.0 * np.logaddexp.reduce(_logs(priors, values), axis=-1))
 
 

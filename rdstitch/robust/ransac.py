@@ -14,15 +14,15 @@ from rdstitch.robust.chance import MIN_OCCUPIED_CELLS
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.minimal import MinimalSolver
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel
-from rdstitch.robust.refinement import PairProblems, refine_pairs
+from rdstitch.robust.refinement import PairProblems, descend
 from rdstitch.robust.sampling import Sampler
 from rdstitch.robust.scoring import plausible, transfer_errors2, truncated_costs
 from rdstitch.solvers.solutions import Solutions
 
 # Halved or doubled, none of these changes what is found, only the time.
 _FIRST_BATCH = 48  # samples of the first round; every round has twice as many as the one before
-_MAX_BATCH = 512  # samples of a round at the most
-_ALONE = 512  # samples up to which the solver that assumes least goes on alone if it needs no more
+# samples of a round at the most, and of the solver that assumes least up to which it goes on alone if it needs no more
+_MAX_BATCH = 512
 _SAMPLES_AT_ONCE = 4096
 _MIN_EXPLORATION = 96  # samples that every solver draws unless its own confidence is reached before
 _QUICK_SCORE = 128  # matches on which hypotheses are compared before the best are scored on all
@@ -43,18 +43,6 @@ class Hypotheses(Rows):
     cost: FloatArray
     inliers: BoolArray  # (B, N), bool
     solver: IntArray  # (B,), intp: which minimal solver found it
-
-    @classmethod
-    def none(cls, data: Measurements) -> "Hypotheses":
-        """No hypothesis yet."""
-        count = len(data)
-        return cls(
-            np.full((count, 3, 3), np.nan),
-            np.zeros(count),
-            np.full(count, np.inf),
-            np.zeros(data.present.shape, dtype=np.bool_),
-            np.zeros(count, dtype=np.intp),
-        )
 
     @classmethod
     def judged(
@@ -97,9 +85,10 @@ def ransac(
     """
     quick = _subset(data)
     states = [_SolverState(solver, data, quick, ordered, tilts, options, index) for index, solver in enumerate(solvers)]
-    best = Hypotheses.none(data)
-    confident = np.zeros(len(data), dtype=np.bool_)
-    active = np.arange(len(data))
+    count = len(data)
+    none, solver = np.zeros(data.present.shape, dtype=np.bool_), np.zeros(count, dtype=np.intp)
+    best = Hypotheses(np.full((count, 3, 3), np.nan), np.zeros(count), np.full(count, np.inf), none, solver)
+    confident, active = np.zeros(count, dtype=np.bool_), np.arange(count)
     batch, hard = _FIRST_BATCH, active[:0]
     while len(active):
         for one, rows in [*((one, hard) for one in states[:-1]), (states[-1], active)]:
@@ -114,7 +103,7 @@ def ransac(
         sure = (drawn[-1] >= needed[-1]) | (explored & (drawn >= needed).any(axis=0))
         confident[active[sure]] = True
         going = ~sure & (drawn.sum(axis=0) < options.max_iterations)
-        active, hard = active[going], active[going & (needed[-1] > _ALONE)]
+        active, hard = active[going], active[going & (needed[-1] > _MAX_BATCH)]
         batch = min(2 * batch, _MAX_BATCH)
     return Search(best, np.sum([one.drawn for one in states], axis=0), confident)
 
@@ -140,10 +129,7 @@ class _SolverState:
         return Sampler(self.solver.sample_size, self.options.max_iterations, [self.options.seed, self.index])
 
     def needed(self, best: Hypotheses, rows: IntArray, *, explore: bool = False) -> FloatArray:
-        """Samples after which a better model than the best of each of some pairs is unlikely to have been missed.
-
-        With ``explore`` at least as many as every solver draws.
-        """
+        """Samples after which a better model of some pairs was hardly missed; ``explore``: that all solvers draw."""
         counts = self.data.count[rows]
         agreeing = np.maximum(best.inliers[rows].sum(axis=1), MIN_OCCUPIED_CELLS)
         good = _SOLVER_SUCCESS * np.minimum(agreeing / counts, 1.0) ** self.solver.sample_size
@@ -222,7 +208,8 @@ class _SolverState:
         """The start or its refinement, whichever is better."""
         problems = PairProblems(model, data, np.full(len(data), scale), None, self.solver.fixed_distortion)
         tilts = None if self.tilts is None else self.tilts[rows]
-        refined, _ = refine_pairs(problems, start.homography, start.distortion, tilts, _LOCAL_STEPS, loose=True)
+        at = problems.start(start.homography, start.distortion, tilts)
+        refined, _ = descend(problems, at, _LOCAL_STEPS, loose=True)
         judged = Hypotheses.judged(
             problems.homography(refined), refined[:, 0], data, self.options.threshold, self.index
         )

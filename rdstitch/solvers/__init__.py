@@ -15,7 +15,8 @@ Which one when, with the number of matches that it needs:
 :func:`rotation_two_point_focal`  2  λ known: rotation, which gives the focal length
 ================================  =  ============================================================
 
-All take batches of samples, (B, k, 2), and return every real solution; see :class:`Solutions`.
+All take batches of samples, (B, k, 2), and return every real solution; see :class:`Solutions`. They raise
+:exc:`rdstitch.errors.ArgumentError` when a shape is wrong or a range is empty.
 """
 
 from rdstitch.solvers.five_point import five_point

@@ -24,11 +24,9 @@ class SampleArrays:
 
     def take(self, samples: IndexArray) -> Self:
         """The arrays of some samples; indices may repeat."""
-        return type(self)(*(_take(getattr(self, field.name), samples) for field in fields(self)))
-
-
-def _take(values: "FloatArray | SampleArrays", samples: IndexArray) -> "FloatArray | SampleArrays":
-    return values.take(samples) if isinstance(values, SampleArrays) else np.take(values, samples, axis=-1)
+        arrays = (getattr(self, field.name) for field in fields(self))
+        taken = (a.take(samples) if isinstance(a, SampleArrays) else np.take(a, samples, axis=-1) for a in arrays)
+        return type(self)(*taken)
 
 
 def sample_count(x1: ArrayLike) -> int:

@@ -39,11 +39,6 @@ def five_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, floa
     Solutions
         Every real λ in the range for which all points are in front of the camera and within the lens model, and the
         homography does not mirror.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong or the range is empty.
     """
 
     def solve(points: FloatArray, _: IndexArray) -> Solutions:
@@ -81,5 +76,4 @@ class DirectionEquation(SampleArrays):
         alpha, beta, gamma = constant + slope * distortion
         a1, a2, a3 = alpha
         first, second, third = beta * gamma
-        value: FloatArray = first * (a2 * a3) + second * (a3 * a1) + third * (a1 * a2)
-        return value
+        return np.asarray(first * (a2 * a3) + second * (a3 * a1) + third * (a1 * a2))

@@ -40,11 +40,6 @@ def four_point(x1: ArrayLike, x2: ArrayLike, distortion_range: tuple[float, floa
     Solutions
         Every real root of either constraint in the range for which all points are in front of the camera and within
         the lens model, and the homography does not mirror.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong or the range is empty.
     """
 
     def solve(points: FloatArray, _: IndexArray) -> Solutions:
@@ -113,10 +108,9 @@ class QuarticEquation(SampleArrays):
         n2 = (v * v).sum(axis=0)
         vsv = (v * (symmetric * v).sum(axis=1)).sum(axis=0)
         a2 = trace * trace
-        value: FloatArray = (
+        return np.asarray(
             3.0 * (t2 * t2) + a2 * (4.0 * t2 - 3.0 * a2) - 4.0 * n2 * (t2 + n2) + trace * (36.0 * det - 32.0 * vsv)
         )
-        return value
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,5 +139,4 @@ class SexticEquation(SampleArrays):
         pairs = np.stack([m2 * m3, m3 * m1, m1 * m2], axis=1)
         product = linear[:, 0] * m1 * pairs[:, 0]
         f, g = (minors[::-1] * pairs * mixed).sum(axis=1)
-        value: FloatArray = product[0] * (g * g * g) - product[1] * (f * f * f)
-        return value
+        return np.asarray(product[0] * (g * g * g) - product[1] * (f * f * f))

@@ -27,11 +27,6 @@ def two_point_rigid(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike, tilt: A
     -------
     Solutions
         One a sample, or none where a point is behind the camera or outside the lens model, or points coincide.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong.
     """
     return _motion(x1, x2, distortion, tilt, height_free=False)
 
@@ -58,11 +53,6 @@ def four_point_dlt(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike) -> Solut
     Solutions
         One a sample, or none where three points are collinear, change sides or are mirrored, or a point is outside the
         lens model.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong.
     """
     lam = distortions(distortion, x1)
 

@@ -51,8 +51,7 @@ class Lines(SampleArrays):
 def squared_radii(points: FloatArray) -> FloatArray:
     """``x² + y²`` of points (2, ...)."""
     x, y = points
-    radii: FloatArray = x * x + y * y
-    return radii
+    return np.asarray(x * x + y * y)
 
 
 def determinants(points: FloatArray, lines: Lines) -> FloatArray:

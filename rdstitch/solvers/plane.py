@@ -8,7 +8,6 @@ rotation R and the plane normal ``n = R e3``, a lifted point ``p(λ) = (x, y, 1 
 """
 
 from dataclasses import dataclass
-from functools import cache
 from typing import Self
 
 import numpy as np
@@ -98,17 +97,10 @@ def lens_range(points: FloatArray, distortion_range: tuple[float, float]) -> tup
         raise ArgumentError(f"distortion range must be (low, high) with low < high, not {distortion_range}")
     radius2 = squared_radii(points).max(axis=(0, 1))
     lows = np.maximum(low, -(1.0 - _MIN_DEPTH) / np.maximum(radius2, 1e-300))
-    first, second = _all_pairs(points.shape[2])
+    first, second = np.triu_indices(points.shape[2], 1)
     nearest2 = squared_radii(np.take(points, first, axis=2) - np.take(points, second, axis=2)).min(axis=(0, 1))
     lows[~(nearest2 > _MIN_SEPARATION**2 * radius2)] = np.inf
     return lows, np.full_like(lows, high)
-
-
-@cache
-def _all_pairs(count: int) -> tuple[IndexArray, IndexArray]:
-    """Indices of both of every two of some points."""
-    first, second = np.triu_indices(count, 1)
-    return first, second
 
 
 def plane_points(points: FloatArray, rotations: TiltRotations, distortion: FloatArray) -> FloatArray:
@@ -116,8 +108,7 @@ def plane_points(points: FloatArray, rotations: TiltRotations, distortion: Float
     x, y = points
     r = rotations.matrices
     seen = r[0] * x + r[1] * y + r[2] * (1.0 + distortion * squared_radii(points))
-    plane: FloatArray = seen[:2] / seen[2]
-    return plane
+    return np.asarray(seen[:2] / seen[2])
 
 
 def motion_homography(

@@ -51,8 +51,7 @@ class RayPairs(SampleArrays):
         """The difference of both sides of the equation of the first pair for g = 1, of degree 6 in λ (..., b)."""
         product, length = self.products(distortion)
         dot, cross = (_spread(self.dot, distortion) + product)[:, 0], (_spread(self.cross, distortion) + length)[:, 0]
-        value: FloatArray = dot[0] * dot[0] * cross[1] - dot[1] * dot[1] * cross[0]
-        return value
+        return np.asarray(dot[0] * dot[0] * cross[1] - dot[1] * dot[1] * cross[0])
 
     def same_side(self, distortion: FloatArray, focal2: FloatArray) -> BoolArray:
         """Test that all angles, (b,), are acute or obtuse in both images alike, which squared tangents hide."""
@@ -74,8 +73,7 @@ def rotation_of_two(bundle: FloatArray) -> FloatArray:
     along, across = _unit(first + second), _unit(first - second)
     normal = np.cross(along, across, axis=0)
     frames = np.stack([along, across, normal], axis=1)
-    rotation: FloatArray = np.einsum("ikb,jkb->bij", frames[:, :, 1], frames[:, :, 0])
-    return rotation
+    return np.asarray(np.einsum("ikb,jkb->bij", frames[:, :, 1], frames[:, :, 0]))
 
 
 def turned_solutions(
@@ -97,5 +95,4 @@ def turned_solutions(
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
-    unit: FloatArray = vectors / np.sqrt((vectors * vectors).sum(axis=0))
-    return unit
+    return np.asarray(vectors / np.sqrt((vectors * vectors).sum(axis=0)))

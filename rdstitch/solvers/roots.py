@@ -171,10 +171,7 @@ def _filled(values: FloatArray) -> FloatArray:
 def _close_pairs(
     coefficients: FloatArray, sample: IndexArray, left: FloatArray, width: float, largest: FloatArray
 ) -> Brackets:
-    """Roots in cells so narrow that the polynomial is a parabola there.
-
-    ``largest`` (B,) is the size of the values of each polynomial: the yardstick of what counts as zero.
-    """
+    """Roots in cells so narrow that the polynomial, of ``largest`` values (B,), is a parabola there."""
     first, last = coefficients[:, 0], coefficients[:, -1]
     right = left + width
     crosses = (first > 0.0) != (last > 0.0)

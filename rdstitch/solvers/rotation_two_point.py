@@ -37,11 +37,6 @@ def rotation_two_point(
     -------
     Solutions
         Every real λ in the range for which all points are within the lens model; homographies are rotations.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong or the range is empty.
     """
 
     def solve(points: FloatArray, _: IndexArray) -> Solutions:

@@ -38,11 +38,6 @@ def rotation_two_point_focal(
     -------
     Solutions
         Every focal length in the range; none where a point is outside the lens model, or points coincide.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong or the range is empty.
     """
     low, high = focal_range
     if not 0.0 < low < high:
@@ -79,5 +74,4 @@ class _AngleEquation(SampleArrays):
         """The equation itself."""
         dot = [(1.0 - t) * self.dot[k, 0] + t * self.product[k, 0] for k in (0, 1)]
         cross = [(1.0 - t) * self.cross[k, 0] + t * self.length[k, 0] for k in (0, 1)]
-        value: FloatArray = dot[0] * dot[0] * cross[1] - dot[1] * dot[1] * cross[0]
-        return value
+        return np.asarray(dot[0] * dot[0] * cross[1] - dot[1] * dot[1] * cross[0])

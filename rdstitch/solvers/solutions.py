@@ -30,10 +30,6 @@ class Solutions(Rows):
     distortion: FloatArray
     focal: FloatArray | None = None
 
-    def __len__(self) -> int:
-        """Number of solutions."""
-        return len(self.sample)
-
     @classmethod
     def empty(cls) -> Self:
         """No solution."""

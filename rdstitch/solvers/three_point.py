@@ -76,11 +76,6 @@ def three_point(
     Solutions
         Those for which all points are in front of the camera and within the lens model, λ is in the range and the
         triangle is not mirrored.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong or the range is empty.
     """
     first = np.asarray(starts, dtype=np.float64)
     if first.ndim != 2 or first.shape[1] != 3 or not len(first) or not np.isfinite(first).all():

@@ -46,11 +46,6 @@ def three_point_similarity(
     Solutions
         Every real λ in the range for which all points are in front of the camera and within the lens model and the
         triangle is not mirrored.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong or the range is empty.
     """
     rotations = TiltRotations.from_tilt(tilt, sample_count(x1))
 
@@ -91,5 +86,4 @@ class DistanceRatioEquation(SampleArrays):
         m13, m12 = x * x + y * y
         w2, w3 = linear[4:]
         w, v = w3[0] * w2[1], w3[1] * w2[0]
-        value: FloatArray = m12[0] * m13[1] * (w * w) - m12[1] * m13[0] * (v * v)
-        return value
+        return np.asarray(m12[0] * m13[1] * (w * w) - m12[1] * m13[0] * (v * v))

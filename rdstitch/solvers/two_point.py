@@ -44,11 +44,6 @@ def two_point(
     -------
     Solutions
         Every real λ in the range for which all points are in front of the camera and within the lens model.
-
-    Raises
-    ------
-    ArgumentError
-        When a shape is wrong or the range is empty.
     """
     rotations = TiltRotations.from_tilt(tilt, sample_count(x1))
 
@@ -80,5 +75,4 @@ class DistanceEquation(SampleArrays):
         constant, slope = self.linear[:, :, :, None] if distortion.ndim > 1 else self.linear
         mx, my, w1, w2 = constant + slope * distortion
         length, (w, v) = mx * mx + my * my, w1 * w2
-        value: FloatArray = length[0] * (v * v) - length[1] * (w * w)
-        return value
+        return np.asarray(length[0] * (v * v) - length[1] * (w * w))

@@ -90,6 +90,11 @@ def adjust(
         width = max(width / 2.0, 1.0)
         weights, pair_weights, noise = _reweighted(equations, state, weights, width)
     _, draws = equations.solve(state, weights, noise, variances, _RESULT_SAMPLES)
+    linked = np.unique(links.tiles)
+    row_std, column_std = (
+        math.sqrt(variance) if np.unique(lines[linked]).size >= _MIN_LINES else None
+        for lines, variance in ((equations.rows, variances.row), (equations.columns, variances.column))
+    )
     return Adjustment(
         places=state.places + equations.middle,
         distortion=float(state.lens[0]),
@@ -98,7 +103,7 @@ def adjust(
         residuals=equations.errors(state)[0],
         squared=equations.squared(state),
         noise=noise,
-        stage=_stage_model(equations, state, variances),
+        stage=StageModel(state.matrix, state.rows, state.columns, row_std, column_std, math.sqrt(variances.tile)),
         off_stage=equations.off_stage(state),
         deviations=draws.places,
     )
@@ -146,12 +151,3 @@ def _students_variance(squares: FloatArray, usual: float) -> float:
         tails = (_TAILS + 2.0) / (_TAILS + squares / max(variance, 1e-9))
         variance = (0.5 * float((tails * squares).sum()) + count * usual) / (len(squares) + count)
     return variance
-
-
-def _stage_model(equations: StageEquations, state: StageState, variances: Variances) -> StageModel:
-    linked = np.unique(equations.links.tiles)
-    row_std, column_std = (
-        math.sqrt(variance) if np.unique(lines[linked]).size >= _MIN_LINES else None
-        for lines, variance in ((equations.rows, variances.row), (equations.columns, variances.column))
-    )
-    return StageModel(state.matrix, state.rows, state.columns, row_std, column_std, math.sqrt(variances.tile))

@@ -29,6 +29,8 @@ _MAX_DARK = 1 / 16  # of the largest sample: cameras of 12 bits are set to a hun
 _CELLS = 24  # cells along each side of a tile at most, or one a pixel where it has fewer
 _SIDE = 512  # pixels of the longer side that are enough
 _DEGREE = 4  # degree of the polynomial that the logarithm of the illumination is
+# Exponents of x and y; the constant is left out, since the gain has mean 1.
+_POWERS = [(i, k) for i in range(_DEGREE + 1) for k in range(_DEGREE + 1 - i) if i + k]
 _TRUNCATED = 0.9113  # variance of a standard normal number within 2.5 of its mean
 
 
@@ -196,15 +198,10 @@ def agrees_with_overlaps(field: FlatField, overlaps: Iterable[tuple[NDArray[Any]
     return slope > 0.5
 
 
-def _powers() -> list[tuple[int, int]]:
-    """Exponents of x and y; the constant is left out, since the gain has mean 1."""
-    return [(i, k) for i in range(_DEGREE + 1) for k in range(_DEGREE + 1 - i) if i + k]
-
-
 def _surface(coefficients: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
     """The polynomial at columns x and rows y, (h, w)."""
     table = np.zeros((_DEGREE + 1, _DEGREE + 1))
-    for (i, k), value in zip(_powers(), coefficients, strict=True):
+    for (i, k), value in zip(_POWERS, coefficients, strict=True):
         table[k, i] = value
     return np.asarray(np.polynomial.polynomial.polygrid2d(y, x, table))
 
@@ -219,7 +216,7 @@ def _fitted(light: FloatArray) -> FloatArray:
     logarithm = np.log(np.maximum(light, max(1e-3 * float(np.median(light)), 1e-9)))
     values = [np.median(np.diff(logarithm, axis=axis), axis=0).ravel() for axis in (1, 2)]
     x, y = np.meshgrid(_middles(light.shape[2]), _middles(light.shape[1]))
-    powers = np.array([x**i * y**k for i, k in _powers()])
+    powers = np.array([x**i * y**k for i, k in _POWERS])
     matrix = np.hstack([np.diff(powers, axis=axis).reshape(len(powers), -1) for axis in (1, 2)]).T
     right = np.concatenate(values)
     weights = np.ones(len(right))

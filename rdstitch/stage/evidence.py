@@ -100,12 +100,10 @@ def wide_peaks(tiles: Sequence[CoarseTile]) -> tuple[FloatArray, FloatArray]:
 
 
 def _may_be_neighbours(y: IntArray, x: IntArray, sizes: IntArray) -> BoolArray:
-    """Whether two tiles of sizes (2, 2), height and width, may lie so far apart (len(y), len(x)): side by side.
-
-    Where they nearly coincide they share the camera and not the specimen.
-    """
+    """Whether two tiles of sizes (2, 2), height and width, may lie so far apart (len(y), len(x)): side by side."""
     height, width = sizes.min(axis=0)
     down, across = (np.minimum(a, v + b) - np.maximum(0, v) for v, (a, b) in ((y, sizes[:, 0]), (x, sizes[:, 1])))
+    # Where they nearly coincide they share the camera and not the specimen.
     aside = (np.abs(y)[:, None] > _MIN_STEP * height) | (np.abs(x) > _MIN_STEP * width)
     broad = (down[:, None] > 0.5 * height) | (across > 0.5 * width)
     enough = (down[:, None] > max(2.0, _MIN_COMMON * height)) & (across > max(2.0, _MIN_COMMON * width))

@@ -125,17 +125,13 @@ def grid_from_table(
 ) -> TileGrid:
     """Places by a CSV file with ``name``, ``x`` and ``y``, or ``x_um`` and ``y_um``, or by Fiji's list, in pixels."""
     text = read_text(file)
-    rows = _fiji_rows(text, file) or csv_rows(text, str(file), _COLUMNS, ("name,x,y", "name,x_um,y_um"))
+    lines = enumerate(map(_FIJI.fullmatch, text.splitlines()), start=1)
+    rows = [Row(f"{file}: line {number}", fitting.groupdict(), ".") for number, fitting in lines if fitting is not None]
+    rows = rows or csv_rows(text, str(file), _COLUMNS, ("name,x,y", "name,x_um,y_um"))
     x, y, unit = ("x", "y", None) if any("x" in row.values for row in rows) else ("x_um", "y_um", 1.0)
     tiles = [Frame(Path(name), label=name) for name in names]
     places = [(row.needed(x), row.needed(y)) for row in RowsByImage(rows).needed(tiles, file, "place")]
     return _grid(np.array(places), unit, size, pixel_size, Path(file).name)
-
-
-def _fiji_rows(text: str, file: str | Path) -> list[Row]:
-    """What Fiji's list of tiles says; nothing of other texts."""
-    lines = enumerate(map(_FIJI.fullmatch, text.splitlines()), start=1)
-    return [Row(f"{file}: line {number}", fitting.groupdict(), ".") for number, fitting in lines if fitting is not None]
 
 
 def grid_from_arrays(

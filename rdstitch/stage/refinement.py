@@ -39,10 +39,6 @@ class BlockMatches(Rows):
     def none(cls) -> "BlockMatches":
         return cls(np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2, 2)))
 
-    def __len__(self) -> int:
-        """Number of blocks."""
-        return len(self.points1)
-
     @property
     def std(self) -> float:
         """Standard deviation of their mean in the worst direction, pixels: along an edge it is large."""

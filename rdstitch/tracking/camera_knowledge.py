@@ -179,7 +179,9 @@ class CameraKnowledge:
     def with_alignment(self, alignment: Alignment, keyframes: Sequence[IncomingFrame], *, keeps_focal: bool) -> Self:
         """Adopt what an alignment of keyframes shows of the camera, for the frames to come."""
         distortion, pair, known = self.distortion, self.pair, self.distortion_known
-        focal = self.focal if keeps_focal else _aligned_focal(alignment)
+        focal, std = self.focal, None if math.isnan(alignment.length_std) else alignment.length_std
+        if not keeps_focal:
+            focal = None if alignment.focal is None else FocalLength(alignment.focal, std, FocalOrigin.ALIGNMENT)
         if not known:
             if alignment.distortion_std < (math.inf if distortion is None else distortion.std):
                 distortion = Estimate(alignment.distortion, alignment.distortion_std)
@@ -224,14 +226,6 @@ class CameraKnowledge:
             # The foot of the camera is off by the error of its tilt, and so is that of the first frame.
             place += 2.0 * (pose.height * self.attitude_std(placed.frame)) ** 2
         return np.asarray(covariance + np.diag([place, place, 0.0, shape.yaw**2]))
-
-
-def _aligned_focal(alignment: Alignment) -> FocalLength | None:
-    """The focal length that an alignment has estimated."""
-    if alignment.focal is None:
-        return None
-    log_std = None if math.isnan(alignment.length_std) else alignment.length_std
-    return FocalLength(alignment.focal, log_std, FocalOrigin.ALIGNMENT)
 
 
 def _shape_std(alignment: Alignment) -> ShapeStd | None:

@@ -165,8 +165,11 @@ class _PairWords(NamedTuple):
 def _in_words(value: Value, finding: Finding, given: Registration) -> object:
     """A value as a sentence has it: what is neither images nor a reason is formatted by the sentence itself."""
     match value:
+        case Misfit.FEW_FEATURES:
+            few = ((given.sources[k].name, few_features(given.keypoints, k)) for k in finding.images)
+            return ", ".join(f"{name} has {why}" for name, why in few if why)
         case Misfit():
-            return _misfit_in_words(value, finding, given)
+            return f"{value.value}{' stitch them on their own' * (finding.kind is Kind.PAIR_MISFITS)}"
         case Images():
             return shortened(_names(given, value))
         case Pairs():
@@ -177,13 +180,6 @@ def _in_words(value: Value, finding: Finding, given: Registration) -> object:
             return "; ".join(f"{body} ({len(shown)}: {shortened(_names(given, shown))})" for body, shown in commonest)
         case _:
             return value
-
-
-def _misfit_in_words(misfit: Misfit, finding: Finding, given: Registration) -> str:
-    if misfit is Misfit.FEW_FEATURES:
-        few = ((given.sources[k].name, few_features(given.keypoints, k)) for k in finding.images)
-        return ", ".join(f"{name} has {why}" for name, why in few if why)
-    return str(misfit.value) + " stitch them on their own" * (finding.kind is Kind.PAIR_MISFITS)
 
 
 def _names(given: Registration, images: Iterable[int]) -> list[str]:

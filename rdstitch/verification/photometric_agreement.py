@@ -154,8 +154,7 @@ def _cells(image: Grey, corners: NDArray[np.intp], margin: int = 0) -> Grey:
     if not len(corners):
         return np.zeros((0, side, side), dtype=np.float32)
     top, left = (corners - margin).T
-    cells: Grey = np.lib.stride_tricks.sliding_window_view(image, (side, side))[top, left]
-    return cells
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(image, (side, side))[top, left])
 
 
 def _have_texture(cells: Grey) -> NDArray[np.bool_]:

@@ -32,10 +32,7 @@ def _disagreeing_pairs(evidence: ResultEvidence) -> Iterator[Finding]:
 
 
 def _misfitting_images(evidence: ResultEvidence) -> Iterator[Finding]:
-    """Images of whose matches too many do not fit into the whole, over all pairs that do.
-
-    A copy, which has no used pairs, is judged by its own.
-    """
+    """Images of whose matches too many do not fit into the whole, over all pairs that do; copies by their own pairs."""
     of_copies = links_by_image(fit for fit in evidence.alignment.links if fit.reason is Unused.COPY)
     links_of = of_copies | links_by_image(evidence.used)
     for k, links in sorted((k, links) for k, links in links_of.items() if evidence.alignment.used[k]):
@@ -223,8 +220,7 @@ class Rule(NamedTuple):
 _PLACES = frozenset(Purpose) - {Purpose.CALIBRATE}
 """A board shifted by a square is as straight as before: the lens is the same."""
 
-_POSES = frozenset({Purpose.TRAJECTORY})
-"""Pictures have their seams, a lens is the same."""
+_POSES = frozenset({Purpose.TRAJECTORY})  # pictures have their seams, a lens is the same
 
 OF_MATCHES = Rule(_mixed_lenses), Rule(_matches_disagree), Rule(_misfitting_images)
 """Failures by matches: images are left out before any pixels are compared."""

@@ -165,8 +165,7 @@ class Overlaps:
         """Normalized correlation at the positions in a box; at all of them if not given."""
         norm = np.sqrt(np.maximum(self.squares1[box], 0.0) * np.maximum(self.squares2[box], 0.0))
         floor = _MIN_NORM * max(float(norm.max()), 1e-12)
-        correlation: Grey = np.where(norm > floor, self.products[box] / np.maximum(norm, floor), np.float32(0.0))
-        return correlation
+        return np.where(norm > floor, self.products[box] / np.maximum(norm, floor), np.float32(0.0))
 
 
 def _spectra(image: Grey, height: int, width: int) -> list[Grey]:

@@ -131,10 +131,7 @@ def unique_shift(first: Drawing, second: Drawing, unique1: Grey, unique2: Grey) 
 
 
 def _peaks(overlaps: Overlaps, first: Grey, offset: FloatArray, least_overlap: float) -> tuple[FloatArray, IntArray]:
-    """Shifts (N, 2) by which two drawings fit, (x, y) from ``offset`` on, to a part of a pixel; their rows and columns.
-
-    The peaks of the correlation.
-    """
+    """Peaks of the correlation of two drawings: shifts (N, 2), (x, y) from ``offset`` on, and where they are in it."""
     score = overlaps.correlation()
     kernel = np.ones((2 * _MIN_SHIFT + 1, 2 * _MIN_SHIFT + 1), dtype=np.uint8)
     enough = overlaps.area >= least_overlap * overlaps.area.max()

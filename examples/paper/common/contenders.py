@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from examples.paper.common.report import Table, curves
-from examples.worlds.instances import PlanarInstances
+from examples.worlds.instances import PlanarInstances, lift
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
-from rdstitch.geometry.radial_homography import lift
 from rdstitch.solvers import Solutions
 
 

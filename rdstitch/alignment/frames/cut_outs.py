@@ -41,10 +41,10 @@ def _extent(points: FloatArray) -> float:
 
 
 def framed_camera(camera: Camera, size: Size) -> Camera:
-    """The camera of a frame with the image in its middle."""
+    """The camera of a larger frame, or of a smaller cut-out, with the same middle."""
     x, y = np.asarray(camera.center) + _margin(camera.image_size, size)
-    ratio = camera.scale / math.hypot(*size) * 2.0
-    return replace(_with_scaled_lens(camera, 1.0 / ratio), image_size=size, center=(float(x), float(y)))
+    scaled = _with_scaled_lens(camera, math.hypot(*size) / 2.0 / camera.scale)
+    return replace(scaled, image_size=size, center=(float(x), float(y)))
 
 
 def framed_link(link: Link, size: Size) -> Link:
@@ -74,29 +74,21 @@ def cut_alignment(alignment: Alignment, sizes: Sequence[Size]) -> Alignment:
         homographies = homographies / np.array([reference, reference, 1.0])[:, None]
     powers = _powers(reference)
     units = np.array([powers.get(name, 1.0) for name in alignment.parameters])
-    cameras = tuple(_cut_camera(camera, image_size) for camera, image_size in zip(framed, sizes, strict=True))
+    cameras = tuple(map(framed_camera, framed, sizes))
     return replace(
         alignment, cameras=cameras, homographies=homographies, covariance=units[:, None] * alignment.covariance * units
     )
 
 
-def _cut_camera(camera: Camera, size: Size) -> Camera:
-    x, y = np.asarray(camera.center) - _margin(size, camera.image_size)
-    scaled = _with_scaled_lens(camera, math.hypot(*size) / math.hypot(*camera.image_size))
-    return replace(scaled, image_size=size, center=(float(x), float(y)))
-
-
 def _with_scaled_lens(camera: Camera, ratio: float) -> Camera:
-    """The same lens where half the diagonal is so many times as long.
-
-    λ is limited to what a camera can have: only the estimate of a single pair lies beyond, where no match reaches.
-    """
+    """The same lens where half the diagonal is so many times as long."""
     powers = _powers(ratio)
     units, covariance = np.array([powers[name] for name in LENS_PARAMETERS]), camera.lens_covariance
     if covariance is not None:
         covariance = tuple(map(tuple, (units[:, None] * np.array(covariance) * units).tolist()))
     return replace(
         camera,
+        # What a camera cannot have is only the estimate of a single pair, where no match reaches.
         distortion=min(camera.distortion * powers["distortion"], MAX_ABS_DISTORTION),
         distortion2=camera.distortion2 * powers["distortion2"],
         distortion3=camera.distortion3 * powers["distortion3"],

@@ -34,8 +34,7 @@ def levelled(
     counted = np.ones(len(matrices), dtype=np.bool_) if counted is None else counted
     down = measured_down(rotations[counted], None if gravity is None else gravity[counted])
     frame = level_frame(rotations[counted], int(counted[:reference].sum()), down)
-    directions: FloatArray = frame @ np.swapaxes(rotations, 1, 2) @ np.diag([1.0, 1.0, focal])
-    return directions
+    return np.asarray(frame @ np.swapaxes(rotations, 1, 2) @ np.diag([1.0, 1.0, focal]))
 
 
 def measured_down(rotations: FloatArray, gravity: FloatArray | None) -> FloatArray | None:
@@ -101,5 +100,4 @@ def _middle(headings: FloatArray) -> float:
 
 
 def _unit(vector: FloatArray) -> FloatArray:
-    unit: FloatArray = vector / max(float(np.linalg.norm(vector)), 1e-12)
-    return unit
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)

@@ -61,13 +61,11 @@ class QuarterTurns:
 
     def directions(self, directions: ArrayLike) -> FloatArray:
         """Directions (N, 3), one in the axes of each camera."""
-        turned: FloatArray = np.einsum("nij,nj->ni", self.matrices, np.asarray(directions))
-        return turned
+        return np.asarray(np.einsum("nij,nj->ni", self.matrices, np.asarray(directions)))
 
     def point(self, point: FloatArray, image: int) -> FloatArray:
         """A point (2,), from the middle of an image."""
-        turned: FloatArray = self.matrices[image, :2, :2] @ point
-        return turned
+        return self.matrices[image, :2, :2] @ point
 
     def link(self, link: Link, cameras: Sequence[Camera]) -> Link:
         """Correspondences of images of these cameras."""
@@ -135,5 +133,4 @@ def _turned_covariance(alignment: Alignment, turn: FloatArray) -> FloatArray:
         if set(pair) <= set(names):
             index = [names.index(name) for name in pair]
             jacobian[np.ix_(index, index)] = turn
-    covariance: FloatArray = jacobian @ alignment.covariance @ jacobian.T
-    return covariance
+    return jacobian @ alignment.covariance @ jacobian.T

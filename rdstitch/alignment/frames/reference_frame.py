@@ -57,10 +57,7 @@ def _border_on_plane(alignment: Alignment, image: int) -> FloatArray:
 
 
 def _nearest_to_horizon(borders: FloatArray, references: FloatArray) -> FloatArray:
-    """Smallest third coordinate of the borders (N, P, 3), in units of the largest, in frames of references (R, 3, 3).
-
-    Shape (N, R).
-    """
+    """Smallest third coordinate of borders (N, P, 3), in units of the largest, in frames (R, 3, 3), shape (N, R)."""
     third = borders @ np.linalg.inv(references)[:, 2].T
     return np.asarray(third.min(axis=1) / np.abs(third).max(axis=1))
 

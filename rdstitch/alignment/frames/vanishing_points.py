@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError
@@ -62,8 +61,7 @@ class Upright:
         basis = np.column_stack([*self.axes, np.cross(*self.axes)])
         if turned:
             basis = nearest_rotation(basis)
-        matrix: FloatArray = np.linalg.inv(basis) @ to_axes(frame, self.focal.value)
-        return matrix
+        return np.linalg.inv(basis) @ to_axes(frame, self.focal.value)
 
 
 def to_axes(frame: FloatArray, focal: float) -> FloatArray:
@@ -145,8 +143,7 @@ class Edges:
 
     def normals(self, focal: float) -> FloatArray:
         """Normals (N, 3) of the planes through the edges and the camera."""
-        normals: FloatArray = self.lines * (focal, focal, 1.0)
-        return normals
+        return self.lines * (focal, focal, 1.0)
 
     def distances(self, directions: FloatArray, focal: float) -> tuple[FloatArray, FloatArray]:
         """Distances (..., N) from middles to vanishing points of directions (..., N or 1, 3), and their gradients."""
@@ -184,17 +181,10 @@ def of_edges(edges: Edges, axis: IntArray, start: FloatArray, focal: Focal, firs
         jacobian = np.vstack([jacobian, [0.0, 0.0, 0.0, prior]])
         residual = np.append(off / edges.error, prior * (log_focal - math.log(focal.value)))
         step = np.linalg.lstsq(jacobian, -residual, rcond=1e-9)[0]
-        axes, log_focal = axes @ rotation(step[:3]).T, log_focal + float(np.clip(step[3], -0.3, 0.3))
+        axes, log_focal = axes @ rotation_about(step[:3]).T, log_focal + float(np.clip(step[3], -0.3, 0.3))
         if np.abs(step).max() < 1e-12:
             break
     return Upright(axes[:2], Focal(math.exp(log_focal), focal.log_std))
-
-
-def rotation(vector: ArrayLike) -> FloatArray:
-    """Rotation (3, 3) about an axis (3,), by its length in radians."""
-    about = np.atleast_2d(np.asarray(vector, dtype=np.float64))
-    matrix: FloatArray = rotation_about(about, np.linalg.norm(about, axis=1))[0]
-    return matrix
 
 
 def nearest_axis(edges: Edges, axes: FloatArray, focal: float) -> IntArray:
@@ -267,5 +257,4 @@ def _best_axes(edges: Edges, start: FloatArray, focal: float, *, depth: bool) ->
 def _along(directions: FloatArray, wanted: FloatArray) -> FloatArray:
     """Directions (N, 3) with length 1 and the sign by which they are nearer to ``wanted``."""
     length = np.linalg.norm(directions, axis=1, keepdims=True)
-    unit: FloatArray = directions / np.maximum(length, 1e-12) * np.where(directions @ wanted < 0.0, -1.0, 1.0)[:, None]
-    return unit
+    return np.asarray(directions / np.maximum(length, 1e-12) * np.where(directions @ wanted < 0.0, -1.0, 1.0)[:, None])

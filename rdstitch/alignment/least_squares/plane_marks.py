@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rdstitch.alignment.least_squares.link_equations import split_lens
 from rdstitch.alignment.motion_models import ModelMatrices
-from rdstitch.arrays import BoolArray, FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray, Rows
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.division_model import undistort
@@ -29,13 +30,12 @@ class Sighting:
 
 
 @dataclass(frozen=True, eq=False)
-class ControlPoints:
-    """P ground control points in M sightings."""
+class ControlPoints(Rows):
+    """M sightings of ground control points."""
 
-    names: tuple[str, ...]  # (P,)
-    places: FloatArray  # (P, 2): metres east and north
-    std: FloatArray  # (P,): of one coordinate, m; 0 where that is not known
-    point: IntArray  # (M,): which of them
+    name: NDArray[np.str_]  # (M,)
+    place: FloatArray  # (M, 2): metres east and north
+    std: FloatArray  # (M,): of one coordinate, m; 0 where that is not known
     image: IntArray  # (M,)
     points: FloatArray  # (M, 2): measured, in half diagonals from the distortion centre
     pixel: FloatArray  # (M,): a pixel, half diagonals
@@ -48,36 +48,20 @@ class ControlPoints:
                 raise ArgumentError(f"control point {one.name} is in image {one.image}, of {len(cameras)}")
             if not (np.isfinite([*one.offset, *one.place]).all() and 0.0 <= (one.std or 0.0) < np.inf):
                 raise ArgumentError(f"control point {one.name}: place, offset and standard deviation must be finite")
-        first = {one.name: one for one in reversed(sightings)}
-        names = tuple(dict.fromkeys(one.name for one in sightings))
-        number = {name: k for k, name in enumerate(names)}
+        pixel = np.array([1.0 / cameras[one.image].scale for one in sightings])
         return cls(
-            names,
-            np.array([first[name].place for name in names]).reshape(-1, 2),
-            np.array([first[name].std or 0.0 for name in names]),
-            np.array([number[one.name] for one in sightings], dtype=np.intp),
+            np.array([one.name for one in sightings], dtype=np.str_),
+            np.array([one.place for one in sightings]).reshape(-1, 2),
+            np.array([one.std or 0.0 for one in sightings]),
             np.array([one.image for one in sightings], dtype=np.intp),
-            np.array([np.array(one.offset) / cameras[one.image].scale for one in sightings]).reshape(-1, 2),
-            np.array([1.0 / cameras[one.image].scale for one in sightings]),
+            np.array([one.offset for one in sightings]).reshape(-1, 2) * pixel[:, None],
+            pixel,
         )
 
     def within(self, images: IntArray) -> Self:
-        """The marks in some of the images (N,), ascending, which get the numbers 0 to N - 1."""
-        shown = self.subset(np.flatnonzero(np.isin(self.image, images)))
+        """The sightings in some of the images (N,), ascending, which get the numbers 0 to N - 1."""
+        shown = self.take(np.isin(self.image, images))
         return replace(shown, image=np.searchsorted(images, shown.image).astype(np.intp))
-
-    def subset(self, shown: IntArray) -> Self:
-        """Some of the sightings only."""
-        known, point = np.unique(self.point[shown], return_inverse=True)
-        return type(self)(
-            tuple(self.names[k] for k in known.tolist()),
-            self.places[known],
-            self.std[known],
-            point.astype(np.intp),
-            self.image[shown],
-            self.points[shown],
-            self.pixel[shown],
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +76,7 @@ class PlaneMarks:
     def places(self, matrices: FloatArray, lens: FloatArray, focal: float) -> FloatArray:
         """Where images with plane-to-image matrices (N, 3, 3) put the marks, (M, 2)."""
         lifted = self._lifted(matrices, lens)[0]
-        places: FloatArray = focal * lifted[:, :2] / lifted[:, 2:]
-        return places
+        return focal * lifted[:, :2] / lifted[:, 2:]
 
     def cost(self, matrices: FloatArray, lens: FloatArray, focal: float) -> float:
         """Squared errors over their variances."""

@@ -37,13 +37,19 @@ def describe_lens(alignment: Alignment, camera: Camera) -> tuple[str, ...]:
         return ("λ is not observable",)
     if alignment.lens_given and camera.lens_covariance is None:
         return (f"λ = {alignment.distortion:.6f}, given",)
-    std, free = _std(camera), np.array([name in alignment.parameters for name in LENS_PARAMETERS])
+    free, std = np.array([name in alignment.parameters for name in LENS_PARAMETERS]), np.zeros(len(LENS_PARAMETERS))
+    if camera.lens_covariance is not None:
+        std = np.sqrt(np.maximum(np.diag(np.array(camera.lens_covariance)), 0.0))
     first = f"λ = {alignment.distortion:.6f} ± {alignment.distortion_std:.6f}"
     if camera.higher:
         largest = camera.one_parameter_fit()[2]
         first += f" (the nearest one-parameter lens, at most {largest:.1f} pixels from the lens found)"
-    lines = [first, *(_coefficient(camera, std, index) for index in (1, 2) if free[index])]
-    lines += [f"{_ORDINALS[index]} coefficient not estimated" for index in (1, 2) if not free[index]]
+    lines, with_first = [first], f"with λ = {camera.distortion:.4f}"
+    for ordinal, name, value, error, estimated in zip(
+        ("second", "third"), "μν", camera.coefficients[1:], std[1:3], free[1:3], strict=True
+    ):
+        found = f"{name} = {value:.4f} ± {error:.4f}, {with_first}" if estimated else "not estimated"
+        lines.append(f"{ordinal} coefficient {found}")
     middle = (np.array(camera.image_size) - 1.0) / 2.0
     if free[CENTER].all():
         x, y = camera.center
@@ -53,18 +59,6 @@ def describe_lens(alignment: Alignment, camera: Camera) -> tuple[str, ...]:
     else:
         lines.append("distortion centre: the middle of the image")
     return (*lines, alignment.lens_reason)
-
-
-def _coefficient(camera: Camera, std: FloatArray, index: int) -> str:
-    value, name = camera.coefficients[index], _COEFFICIENT_NAMES[index]
-    return f"{_ORDINALS[index]} coefficient {name} = {value:.4f} ± {std[index]:.4f}, with λ = {camera.distortion:.4f}"
-
-
-def _std(camera: Camera) -> FloatArray:
-    """Standard deviations of :data:`LENS_PARAMETERS`, shape (5,), half-diagonal frame."""
-    if camera.lens_covariance is None:
-        return np.zeros(len(LENS_PARAMETERS))
-    return np.sqrt(np.maximum(np.diag(np.array(camera.lens_covariance)), 0.0))
 
 
 def radius_std(camera: Camera, radii: FloatArray) -> FloatArray:

@@ -43,7 +43,9 @@ def choose_observable_lens(
     votes = vote([k.relation.distortion for k in task.links], [k.relation.distortion_std for k in task.links])
     links = links_at(np.where(first, np.nan_to_num(votes.distortion), 0.0), first)
     pairwise = pairwise_homographies(links)
-    moving = _observable(pairwise)
+    # One homography a pair leaves λ well determined, without what the prior says.
+    information = 1.0 / float(pairwise.covariance[0, 0]) - LENS_PRIORS[0].curvature(float(pairwise.parameters.lens[0]))
+    moving = information > OBSERVABLE_STD**-2.0
     if sample.image_count <= _FEW_VIEWS or not moving:
         with_given_lens = pairwise_homographies(links_at(given, none))
         if not moving or _is_depth(pairwise, with_given_lens):
@@ -61,11 +63,3 @@ def _is_depth(free_lens: BundleAdjustmentResult, given_lens: BundleAdjustmentRes
     without, with_lens = residual_coherence(given_lens), residual_coherence(free_lens)
     smaller = with_lens.correlation > COHERENT_CORRELATION and without.size < _LENS_OVER_DEPTH * with_lens.size
     return shows_relief(without) and smaller
-
-
-def _observable(pairwise: BundleAdjustmentResult) -> bool:
-    """Whether one homography a pair leaves λ well determined."""
-    distortion = float(pairwise.parameters.lens[0])
-    # Without what the prior says.
-    information = 1.0 / float(pairwise.covariance[0, 0]) - LENS_PRIORS[0].curvature(distortion)
-    return bool(information > OBSERVABLE_STD**-2.0)

@@ -94,8 +94,7 @@ class PlanarModel(MotionModel):
 
     def _tilts(self, poses: FloatArray, shared: FloatArray) -> FloatArray:
         """How the tilts of the images differ from the shared one (N, 2), radians."""
-        tilts: FloatArray = poses[:, [PSI, THETA]] * (np.exp(shared[2]) if self.free_tilts else 1.0)
-        return tilts
+        return poses[:, [PSI, THETA]] * (np.exp(shared[2]) if self.free_tilts else 1.0)
 
     def _tilted(self, tilts: FloatArray, shared: FloatArray) -> FloatArray:
         """Poses (N, 6) at the origin with tilts (N, 2) that differ by so much from the shared one, radians."""
@@ -124,8 +123,7 @@ class PlanarModel(MotionModel):
     def nominal_homographies(self, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """``diag(f, f, 1) R_i``."""
         poses = self._tilted(attitudes, shared)
-        matrices: FloatArray = self.matrices(poses, shared).matrices
-        return matrices
+        return self.matrices(poses, shared).matrices
 
     def nearest_poses(self, homographies: FloatArray, shared: FloatArray, attitudes: FloatArray) -> FloatArray:
         """The nearest poses, given how the tilts of the images differ from the shared one."""

@@ -75,8 +75,7 @@ class RotationModel(MotionModel):
 def rotation_from_vector(vectors: FloatArray) -> FloatArray:
     """Rotations (N, 3, 3) about axes (N, 3) by their length, radians (Rodrigues); long ones are shortened."""
     angle = np.linalg.norm(vectors, axis=1)
-    vectors = vectors * np.minimum(1.0, _MAX_STEP / np.maximum(angle, 1e-300))[:, None]
-    return rotation_about(vectors, np.minimum(angle, _MAX_STEP))
+    return rotation_about(vectors * np.minimum(1.0, _MAX_STEP / np.maximum(angle, 1e-300))[:, None])
 
 
 ROTATION = RotationModel()

@@ -57,8 +57,7 @@ def _dominant(du: NDArray[np.float32], dv: NDArray[np.float32]) -> FloatArray:
     window = np.fft.irfft(np.fft.rfft(sums) * _WINDOW_SPECTRUM, _BINS)
     best = (window**2).sum(axis=0).argmax(axis=1)
     u, v = window[:, np.arange(count), best]
-    direction: FloatArray = np.arctan2(v, u) % (2 * np.pi)
-    return direction
+    return np.asarray(np.arctan2(v, u) % (2 * np.pi))
 
 
 def _gradients() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:

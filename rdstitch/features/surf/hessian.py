@@ -62,9 +62,6 @@ class Blobs(Rows):
     # (N,), int8: sign of the trace of the Hessian: +1 for dark blobs, -1 for light ones
     laplacian_sign: NDArray[np.int8]
 
-    def __len__(self) -> int:
-        return len(self.points)
-
     @property
     def scale(self) -> FloatArray:
         """The s of the paper, pixels, shape (N,)."""
@@ -177,10 +174,5 @@ def _neighbourhoods(
     determinant: NDArray[np.float32], layer: NDArray[np.intp], row: NDArray[np.intp], column: NDArray[np.intp]
 ) -> NDArray[np.float32]:
     """Values around places, shape (N, 3, 3, 3), axes layer, row, column."""
-    step = np.arange(-1, 2)
-    values: NDArray[np.float32] = determinant[
-        layer[:, None, None, None] + step[:, None, None],
-        row[:, None, None, None] + step[:, None],
-        column[:, None, None, None] + step,
-    ]
-    return values
+    places = np.stack([layer, row, column])[..., None, None, None] + np.indices((3, 3, 3))[:, None] - 1
+    return np.asarray(determinant[tuple(places)])

@@ -16,14 +16,13 @@ from rdstitch.alignment.frames.vanishing_points import (
     of_edges,
     of_rectangle,
     of_scene,
-    rotation,
     to_axes,
 )
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.features.line_segments import MEGAPIXELS, line_segments
 from rdstitch.geometry.camera import Camera
-from rdstitch.geometry.planar_motion import nearest_rotation
+from rdstitch.geometry.planar_motion import nearest_rotation, rotation_about
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.upright_options import UprightOptions
 from rdstitch.pipeline.composition.map_canvas import plan
@@ -82,7 +81,7 @@ def view_rotation(options: UprightOptions) -> FloatArray | None:
     yaw, pitch, roll = np.radians([options.yaw, options.pitch, options.roll])
     if not (yaw or pitch or roll):
         return None
-    return (rotation((0.0, yaw, 0.0)) @ rotation((pitch, 0.0, 0.0)) @ rotation((0.0, 0.0, roll))).T
+    return (rotation_about((0.0, yaw, 0.0)) @ rotation_about((pitch, 0.0, 0.0)) @ rotation_about((0.0, 0.0, roll))).T
 
 
 def _cut_away(placed: PlacedImages, options: CompositeOptions, matrix: FloatArray) -> float:

@@ -84,12 +84,12 @@ def test_normal_equations_are_those_of_the_jacobian(own: bool) -> None:
     relative = data.present[0] / (1.0 + found.squared[0] / 9.0)
     expected = np.einsum("inp,ijn,jnq,n->pq", jacobian, precision, jacobian, relative**2)
     gradient = np.einsum("inp,ijn,jn,n->p", jacobian, precision, error(values), relative**2)
-    equations = entry_equations(found, data.present, np.array([3.0]), True)
-    np.testing.assert_allclose(equations.information[0], expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
-    np.testing.assert_allclose(equations.gradient[0], gradient, rtol=1e-5, atol=1e-5 * np.abs(gradient).max())
-    np.testing.assert_allclose(equations.cost[0], (found.squared[0] * relative).sum())
+    cost, normal, slope = entry_equations(found, data.present, np.array([3.0]), True)
+    np.testing.assert_allclose(normal[0], expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(slope[0], gradient, rtol=1e-5, atol=1e-5 * np.abs(gradient).max())
+    np.testing.assert_allclose(cost[0], (found.squared[0] * relative).sum())
     shares = influence(found, data.present, np.array([3.0]), True)[0]
-    np.testing.assert_allclose(shares.sum(axis=0), equations.gradient[0])
+    np.testing.assert_allclose(shares.sum(axis=0), slope[0])
 
 
 def test_the_samples_of_a_pair_are_its_own_however_many_others_draw() -> None:

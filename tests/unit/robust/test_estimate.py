@@ -11,6 +11,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.radial_homography import RadialHomography
 from rdstitch.robust import EstimationOptions, PairMatches, estimate_radial_homographies, estimate_radial_homography
+from rdstitch.robust.priors import prior_costs
 
 MATCHES = correspondences(150, seed=4, outliers=0.3)
 LENS = MATCHES.truth.camera
@@ -51,7 +52,7 @@ def test_a_pair_is_checked_where_it_is_made() -> None:
         ((points, points * np.nan, lens, lens), "not finite"),
         (([["a", "b"]], points, lens, lens), "points1 must be an array of numbers"),
         ((points, points, lens, lens, np.ones(3)), "quality must have shape"),
-        ((points, points, lens, lens, None, np.zeros(2)), "tilts must have shape"),
+        ((points, points, lens, lens, None, np.zeros(2)), "tilt must be"),
     ):
         with pytest.raises(ArgumentError, match=says):
             PairMatches(*wrong)
@@ -120,7 +121,7 @@ def test_focal_lengths_that_differ_count_as_uncertain_in_either_order(focals: tu
     first, second = (Camera((640, 480)).with_focal(focal, "exif") for focal in focals)
     pair = PairMatches(MATCHES.points1, MATCHES.points2, first, second)
     assert pair.camera1.focal == pair.camera2.focal == pytest.approx(600.0 * np.sqrt(2.0))
-    assert all(pair.focal_prior.cost(np.log(focal / first.scale)) < 1.0 for focal in focals)
+    assert all(prior_costs((pair.focal_prior,), np.log([focal / first.scale]))[0] < 1.0 for focal in focals)
 
 
 def test_a_focal_length_that_one_image_states_is_that_of_both() -> None:

@@ -14,7 +14,7 @@ from rdstitch.robust.covariance import covariances
 from rdstitch.robust.measurements import Measurements
 from rdstitch.robust.pair_models import HomographyPairModel, PairModel, PlanarPairModel
 from rdstitch.robust.priors import Prior, focal_prior
-from rdstitch.robust.refinement import PairProblems, refine_pairs
+from rdstitch.robust.refinement import PairProblems, descend
 
 LENS = Camera((640, 480))
 FOCAL = 1.3
@@ -88,7 +88,7 @@ def test_it_comes_to_the_truth(model: PairModel, fixed: bool) -> None:
     near = shift @ H
     problems = _problems(model, noise=0.02, fixed=fixed)
     start = np.array([DISTORTION if fixed else -0.15])
-    found, equations = refine_pairs(problems, near[None], start, None, 30)
+    found, equations = descend(problems, problems.start(near[None], start), 30)
     assert found[0, 0] == pytest.approx(DISTORTION, abs=1e-4)
     seen = problems.normal_equations(found)
     np.testing.assert_array_equal(seen.errors, equations.errors)

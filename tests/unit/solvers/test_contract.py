@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from examples.paper.common.five_point_qep import five_point_qep
 from examples.paper.common.rotation_three_point import rotation_three_point
-from examples.worlds.instances import planar_instances, rotation_instances
+from examples.worlds.instances import lift, planar_instances, rotation_instances
 from rdstitch import solvers
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.planar_motion import PlanarMotion, rotation_from_tilt
-from rdstitch.geometry.radial_homography import lift, transfer
+from rdstitch.geometry.radial_homography import transfer
 from rdstitch.solvers import Solutions
 
 TILT = (0.12, -0.2)
