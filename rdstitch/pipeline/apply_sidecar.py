@@ -18,11 +18,11 @@ from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.canvas_options import CanvasOptions
 from rdstitch.options.option import declared, options_of, with_fields
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.composition.compose import CanvasPlan, compose_images
+from rdstitch.pipeline.composition.compose import CanvasLayout, compose_images
 from rdstitch.pipeline.composition.straighten import reoriented
-from rdstitch.pipeline.output_plan import OutputPlan
+from rdstitch.pipeline.output_files import OutputFiles
 from rdstitch.pipeline.replacements import read_replacements
-from rdstitch.pipeline.run import Run
+from rdstitch.pipeline.run import RecipeInput, Run
 from rdstitch.pipeline.viewer_pages import plainly_viewed, write_page
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages, SavedGrid
@@ -86,33 +86,27 @@ def apply(
         raise InputError(mismatch)
     chosen = options_of(CompositeOptions, composite or saved.composite, "composite")
     chosen = chosen.overridden(**composing)
-    run = apply_run(saved, None if output is None else Path(output), chosen, options, progress)
-    given = as_inputs(images, options.channel_order)
+    named = as_inputs(images, options.channel_order)
     if saved.record.stage is not None:
-        given = with_position_folders(given)
-    run = replace(run, inputs=given)
-    with run.open_images() as replacements:
-        OutputPlan.of_images(run, replacements.files).check()
+        named = with_position_folders(named)
+    settings = settings_of(saved, chosen, options)
+    files = [saved.path, *options.files, *settings.files]
+    given = RecipeInput(named, settings, every=options.every, files=files)
+    run = Run.of(given, output, progress=progress)
+    with given.find_images(run.output) as replacements, run.outputs:
+        OutputFiles.of_images(run, replacements.files).check()
         result = apply_to_images(saved, replacements, run, options)
     return replace(result, messages=(*([Message(mismatch)] if mismatch else []), *result.messages))
 
 
-def apply_run(
-    saved: SavedRegistration,
-    output: Path | None,
-    composite: CompositeOptions,
-    options: ApplyOptions,
-    progress: Progress,
-) -> Run:
+def settings_of(saved: SavedRegistration, composite: CompositeOptions, options: ApplyOptions) -> StitchOptions:
     """What the stages after registration take of the options."""
-    settings = StitchOptions(
+    return StitchOptions(
         composite=composite,
         reference=saved.images[saved.reference].name,
         channel_order=options.channel_order,
         **options.of_run,
     )
-    run = Run.of((), settings, output=output, every=options.every, progress=progress)
-    return replace(run, read=[saved.path, *options.files, *settings.files])
 
 
 def apply_to_images(saved: SavedRegistration, images: FoundImages, run: Run, options: ApplyOptions) -> Recomposition:
@@ -120,11 +114,11 @@ def apply_to_images(saved: SavedRegistration, images: FoundImages, run: Run, opt
     output = run.output
     given = read_replacements(saved, images.frames, options, run.guard, run.options.composite.max_memory)
     placed = saved.record.output.place is not None
-    OutputPlan.of_images(run, ()).check_places(list(given.sources.values()), placed=placed)
+    OutputFiles.of_images(run, ()).check_places(list(given.sources.values()), placed=placed)
     lens, of_lens = _lens_of_band(saved, given.sources, run.progress)
-    plan, of_turn = _laid_out(saved, given.sources, lens, run.options.composite)
-    composed, of_output = compose_images(plan, run)
-    sources = dict(zip(given.sources, plan.placed.sources, strict=True))
+    layout, of_turn = _laid_out(saved, given.sources, lens, run.options.composite)
+    composed, of_output = compose_images(layout, run)
+    sources = dict(zip(given.sources, layout.placed.sources, strict=True))
     result = Recomposition(
         saved=saved,
         sources=tuple(map(sources.get, range(len(saved.images)))),
@@ -143,14 +137,14 @@ def apply_to_images(saved: SavedRegistration, images: FoundImages, run: Run, opt
 
 def _laid_out(
     saved: SavedRegistration, sources: Mapping[int, Source], lens: BandLens | None, composite: CompositeOptions
-) -> tuple[CanvasPlan, list[Message]]:
+) -> tuple[CanvasLayout, list[Message]]:
     """Where the images lie, by the sidecar and the lens of their band."""
     if lens is not None:
         sources = {index: replace(source, camera=lens.camera(source.camera)) for index, source in sources.items()}
     placed, of_turn = reoriented(_placed(saved, sources, lens), composite, saved.composite)
     if (grid := _same_grid(saved, sources, composite)) is not None:
         placed = replace(placed, grid=grid)
-    return CanvasPlan.of(placed, composite), of_turn
+    return CanvasLayout.of(placed, composite), of_turn
 
 
 def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions) -> SavedGrid | None:

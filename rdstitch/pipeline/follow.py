@@ -50,17 +50,14 @@ def follow(
     poses: FollowedPoses | None = None,
     *,
     comes_again: Callable[[Frame], bool] = lambda frame: False,
-    preview: Path | None = None,
-    refresh: float = 5.0,
+    preview: LivePreview | None = None,
 ) -> Generator[Pose]:
     """Register frames as they arrive: a pose for each, and more for those that find their place, or another one, later.
 
     Features are fewer than in a recipe, loops are not closed, and memory does not grow with the number of frames.
-    ``comes_again`` says whether a frame that could not be read whole will come again; ``preview`` is written every
-    ``refresh`` seconds at most.
+    ``comes_again`` says whether a frame that could not be read whole will come again.
     """
     tracker = Tracker(options, poses, patient=True)
-    live_preview = None if preview is None else LivePreview(preview, refresh)
     numbers = count()
     unread: dict[Path, int] = {}  # numbers of frames that come again
     of_preview: list[Message] = []  # told with the next frame
@@ -79,13 +76,13 @@ def follow(
         yield from poses_of_frame
         of_preview = []
         if source is not None:
-            if live_preview is not None:
-                of_preview = live_preview.add(source, poses_of_frame[-1].tracked)
+            if preview is not None:
+                of_preview = preview.add(source, poses_of_frame[-1].tracked)
             source.decoded_images.clear()
     yield from tracker.finish()
-    if live_preview is not None:
+    if preview is not None:
         with suppress(RdstitchError):  # what it was a preview of comes now
-            live_preview.write()
+            preview.write()
 
 
 class ReadFrame(NamedTuple):

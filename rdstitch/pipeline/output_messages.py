@@ -5,7 +5,8 @@ from pathlib import Path
 
 from rdstitch.compositing import Canvas, CompositeOptions, SeamBreak, SeamQuality
 from rdstitch.compositing.projection import PLANE
-from rdstitch.georeferencing.georeference import Georeference, check_summary, map_summary
+from rdstitch.georeferencing.georeference import check_summary, map_summary
+from rdstitch.georeferencing.place_on_map import MapPlacement
 from rdstitch.inputs.source import Source
 from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
@@ -36,16 +37,16 @@ def cut_away_messages(placed: PlacedImages, canvas: Canvas, options: CompositeOp
     return [Message(text, severity="note")] if fraction > Limits.visible_cut else []
 
 
-def place_messages(place: Georeference | None, reason: str, placed: PlacedImages) -> list[Message]:
+def place_messages(placement: MapPlacement, placed: PlacedImages) -> list[Message]:
     """What the user should know of the place; nothing where hardly an image has a position."""
     lost = [source for source in placed.sources if source.metadata.gps_problem]
     messages = [
         Message(f"{each.metadata.gps_problem}, and was not used; give --positions", (str(each.path),)) for each in lost
     ]
-    if place is None:
-        known = reason and placed.has_place
-        return [*messages, Message(f"not georeferenced: {reason}")] if known else messages
-    messages += [Message(reason)] if reason else []
+    if (place := placement.place) is None:
+        known = placement.reason and placed.has_place
+        return [*messages, Message(f"not georeferenced: {placement.reason}")] if known else messages
+    messages += [Message(placement.contradiction)] if placement.contradiction else []
     messages.append(Message(map_summary(place), severity="note"))
     if place.assumption:
         messages.append(Message(place.assumption))

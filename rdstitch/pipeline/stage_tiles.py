@@ -26,9 +26,9 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.options.tile_options import TileOptions
 from rdstitch.pipeline.composition.flat_field import NO_FLAT_FIELD, with_flat_field
 from rdstitch.pipeline.composition.lay_out import lay_out
-from rdstitch.pipeline.output_plan import OutputPlan
+from rdstitch.pipeline.output_files import OutputFiles
 from rdstitch.pipeline.recipes import compose_registration
-from rdstitch.pipeline.run import Run
+from rdstitch.pipeline.run import RecipeInput, Run
 from rdstitch.pipeline.tiles_as_registration import tiles_as_registration
 from rdstitch.results.messages import Message, left_out
 from rdstitch.results.registration import Registration
@@ -85,27 +85,23 @@ def tiles(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = with_fields(options_of(TileOptions, options), fields)
-    files = FilesBeside.of(ImageFiles, beside, "tiles")
-    run = replace(_tile_run(options, progress, output, files), inputs=as_tiles(inputs))
-    with run.open_images() as images:
-        registration, plan = _registered(images, run, options, positions_file)
+    given = _as_recipe_input(inputs, options)
+    run = Run.of(given, output, FilesBeside.of(ImageFiles, beside, "tiles"), progress)
+    with given.find_images(run.output) as images, run.outputs:
+        registration, files = _registered(images, run, options, positions_file)
         with run.executor(len(registration.sources)) as executor:
             chosen = lay_out(registration, no_local_alignment("tiles on a stage"), options.composite)
-            chosen = replace(chosen, plan=replace(chosen.plan, photographs=False))
-            return compose_registration(chosen, run, plan, executor)
+            return compose_registration(chosen, run, files, executor)
 
 
-def _tile_run(
-    options: TileOptions, progress: Progress, output: str | Path | None = None, beside: FilesBeside = NOTHING_BESIDE
-) -> Run:
-    """A run with what the stages after registration take of the options."""
+def _as_recipe_input(tiles: Images | Iterable[Any], options: TileOptions) -> RecipeInput:
+    """Tiles with what the stages after registration take of the options."""
     settings = StitchOptions(
         distortion=None if options.distortion == "auto" else options.distortion,
         composite=options.composite,
         **options.of_run,
     )
-    run = Run.of((), settings, output=output, beside=beside, progress=progress)
-    return replace(run, read=[*options.files, *settings.files])
+    return RecipeInput(as_tiles(tiles), settings, files=options.files)
 
 
 @one_native_thread()
@@ -127,8 +123,9 @@ def place_tiles(
         As for :func:`tiles`.
     """
     options = with_fields(options_of(TileOptions, options), fields)
-    run = replace(_tile_run(options, progress), inputs=as_tiles(inputs))
-    with run.open_images() as images:
+    given = _as_recipe_input(inputs, options)
+    run = Run.of(given, progress=progress)
+    with given.find_images() as images, run.outputs:
         registration, _ = _registered(images, run, options, positions_file)
     assert registration.tiles is not None
     return registration.tiles, registration
@@ -136,16 +133,16 @@ def place_tiles(
 
 def _registered(
     images: FoundImages, run: Run, options: TileOptions, positions_file: str | Path | None
-) -> tuple[Registration, OutputPlan]:
+) -> tuple[Registration, OutputFiles]:
     """The places of all tiles, once it is clear that everything can be written; their tables are, and what will be."""
     tables = [Path(file) for file in (positions_file, options.save_flat_field) if file is not None]
     names = [frame.name for frame in images.frames]
-    plan = OutputPlan.of_images(run, images.files, names, more_files=tables)
-    plan.check()
+    files = OutputFiles.of_images(run, images.files, names, more_files=tables)
+    files.check()
     frames, stored, notes = tile_frames(images.frames, options.z, options.time)
     limit = options.composite.max_memory
     sources, unread = read_sources(frames, skip_bad=not options.strict, guard=run.guard, max_memory=limit)
-    plan.check_places(sources)
+    files.check_places(sources)
     sources, excluded = _of_one_kind(sources, options.strict)
     unread += excluded
     while True:
@@ -163,7 +160,7 @@ def _registered(
     tiled = replace(tiled, z=options.z, time=options.time)
     _write_beside(run.outputs, positions_file, options, sources, tiled)
     registration = tiles_as_registration(sources, tiled)
-    return registration.with_messages([*unread, *images.messages, *notes, *messages]), plan
+    return registration.with_messages([*unread, *images.messages, *notes, *messages]), files
 
 
 def _of_one_kind(sources: list[Source], strict: bool) -> tuple[list[Source], list[Message]]:
@@ -229,7 +226,7 @@ def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
     field = sources[0].flat_field
     assert field is not None
     raw = [replace(source, flat_field=None) for source in sources]
-    pairs = tiled.links.tiles[tiled.adjustment.weights > 0.5]
+    pairs = tiled.links.tiles[tiled.adjustment.holding]
     chosen = pairs[evenly_spaced(len(pairs), _SAMPLED_OVERLAPS)]
     places = tiled.adjustment.places
     compared = ((raw[a].read().pixels, raw[b].read().pixels, places[b] - places[a]) for a, b in chosen.tolist())

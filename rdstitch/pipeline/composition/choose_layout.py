@@ -28,6 +28,7 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.composition.lay_out import (
     IMAGE_GRID,
     CandidateLayout,
+    RegistrationLayout,
     align_registration_locally,
     is_stretched,
     lay_out,
@@ -57,31 +58,32 @@ _BY_CHANCE = Message(
 
 @dataclass(frozen=True, eq=False)
 class _Trials:
-    """Lays out registrations of the same images as the output would have them, with exposure and seams."""
+    """Lays out registrations of the same images as the output would have them."""
 
     options: StitchOptions
     pano: bool
     edges_of: Callable[[int], FloatArray]  # straight edges in an image
 
-    def lay_out(self, registration: Registration, local: LocalAlignment | None = None) -> CandidateLayout:
+    def lay_out(self, registration: Registration, local: LocalAlignment | None = None) -> RegistrationLayout:
         """Lay out a registration in pixels of the working size."""
         options = self.options
         whole = on_whole_pixels(_with_frontal_reference(at_full_size(registration), options, always=self.pano))
         if local is None:
             local = align_registration_locally(whole, options.local_alignment, self.edges_of, options.threads)
-        laid_out = lay_out(whole, local, options.composite)
-        if options.dry_run:
-            return laid_out
-        return replace(laid_out, plan=laid_out.plan.decided(options.compositing))
+        return lay_out(whole, local, options.composite)
+
+    def judge(self, registration: Registration, local: LocalAlignment | None = None) -> CandidateLayout:
+        """The same, with exposure and seams."""
+        return self.lay_out(registration, local).judged(self.options.compositing)
 
     def attempt(self, registration: Registration) -> CandidateLayout | None:
         """Lay out an alternative registration; None where it has no canvas, or none that the options can turn."""
         with suppress(LimitError, ArgumentError):
-            return self.lay_out(registration)
+            return self.judge(registration)
         return None
 
 
-def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner) -> CandidateLayout:
+def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner) -> RegistrationLayout:
     """The layout whose seams hold, or break the least; of a panorama always in the frame of an image.
 
     Pixels are those of the working size.
@@ -92,7 +94,7 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
         return trials.lay_out(registration)
     first, too_large = None, None
     try:
-        first = trials.lay_out(registration)
+        first = trials.judge(registration)
     except LimitError as error:
         too_large = error
     if first is None or first.seams.mostly_unlike:
@@ -148,7 +150,7 @@ def _alternatives(
         if not first.faults:
             return
         if first.local.fields and trials.options.local_alignment == "auto":
-            yield trials.lay_out(registration, no_local_alignment("seams hold better without it"))
+            yield trials.judge(registration, no_local_alignment("seams hold better without it"))
         if first.local.by_heights:
             return  # parallax that the places of the cameras explain is not that of another model
         if (other_surface := _other_surface(registration, first, trials, aligner)) is not None:
@@ -189,10 +191,10 @@ def _other_models(
     """The same images aligned by other models, where every one finds its place."""
     alignment = registration.alignment
     # What breaks along seams may have moved, and proves nothing against a layout that fits; one that is stretched does.
-    stretched = first is None or is_stretched(first.plan)
+    stretched = first is None or is_stretched(first.layout)
     allowed = max(options.threshold * stretched, _MISFIT * _error(registration))
     names = [name for name in _MODELS if name != alignment.model] if options.model == "auto" else []
-    if first is not None and first.plan.placed.has_place:  # a map needs a plane with a metric
+    if first is not None and first.layout.placed.has_place:  # a map needs a plane with a metric
         names = [name for name in names if MODELS[name].has_metric_poses]
     for name in names:
         by_name = replace(aligner, options=replace(aligner.options, model=name))

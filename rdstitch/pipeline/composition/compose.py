@@ -15,7 +15,6 @@ from rdstitch.compositing import (
     Decisions,
     FileComposite,
     PlacedImage,
-    SeamQuality,
     compose_decided,
     compose_to_file,
     decide,
@@ -24,12 +23,13 @@ from rdstitch.compositing import (
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.tiles import BlockRunner
 from rdstitch.georeferencing.georeference import Georeference, world_file_paths
+from rdstitch.georeferencing.place_on_map import MapPlacement
 from rdstitch.inputs.source import Source
 from rdstitch.io.formats import check_memory, check_size
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.options.upright_options import Corners
-from rdstitch.pipeline.composition.map_canvas import place_on_canvas, plan_on_map
+from rdstitch.pipeline.composition.map_canvas import canvas_on_map, place_on_canvas
 from rdstitch.pipeline.output_messages import (
     cut_away_messages,
     differing_profile_messages,
@@ -47,37 +47,40 @@ from rdstitch.system.process_memory import return_freed_memory
 
 
 @dataclass(frozen=True)
-class CanvasPlan:
-    """Images on a canvas, and what was decided on small versions of them."""
+class CanvasLayout:
+    """Images on the canvas of the output."""
 
     placed: PlacedImages
     canvas: Canvas
     images: Sequence[PlacedImage]
-    georeference: Georeference | None
-    not_georeferenced: str  # why
-    decisions: Decisions | None = None
-    photographs: bool = True  # whether seams are to be judged as a person sees them
+    placement: MapPlacement
 
     @classmethod
     def of(cls, placed: PlacedImages, options: CompositeOptions) -> Self:
-        """Plan the canvas."""
-        canvas, place, reason = plan_on_map(placed, options)
+        """Lay the images out."""
+        canvas, placement = canvas_on_map(placed, options)
         if options.rectangle is not None:
             canvas = replace(canvas, cropped_to=_box_of_rectangle(placed, options.rectangle, canvas))
-        return cls(placed, canvas, placed.images(canvas), place, reason)
+        return cls(placed, canvas, placed.images(canvas), placement)
 
-    def decided(self, options: CompositeOptions) -> Self:
-        """The plan with exposure, seams and crop of its images, decided on small versions of them."""
-        return replace(self, decisions=decide(self.images, self.canvas, options))
+    def decide(self, options: CompositeOptions) -> Decisions:
+        """Decide on exposure, seams and crop of the images, on small versions of them."""
+        return decide(self.images, self.canvas, options)
 
-    @property
-    def seams(self) -> SeamQuality:
-        """What its seams are like."""
-        return SeamQuality() if self.decisions is None else self.decisions.quality
+
+@dataclass(frozen=True)
+class DecidedLayout(CanvasLayout):
+    """Images on the canvas of the output, for which exposure, seams and crop were decided by the options."""
+
+    decisions: Decisions
+
+    def decide(self, options: CompositeOptions) -> Decisions:
+        """What was decided."""
+        return self.decisions
 
 
 def compose_images(
-    plan: CanvasPlan, run: Run, run_blocks: BlockRunner | None = None
+    layout: CanvasLayout, run: Run, run_blocks: BlockRunner | None = None
 ) -> tuple[OutputImage, list[Message]]:
     """Put images on a canvas, in memory or into a file that can hold it, of a dry run plan it; and what to know of it.
 
@@ -86,62 +89,60 @@ def compose_images(
     """
     return_freed_memory()
     options, outputs = run.options.compositing, run.outputs
-    placed, canvas, place, output = plan.placed, plan.canvas, plan.georeference, run.output
+    placed, canvas, placement, output = layout.placed, layout.canvas, layout.placement, run.output
     messages = [
         *masked_messages(placed),
-        *place_messages(place, plan.not_georeferenced, placed),
+        *place_messages(placement, placed),
         *cut_away_messages(placed, canvas, options),
     ]
     # A crop may yet make it fit.
     if output is not None and options.crop == "none":
         check_size(output, canvas.size)
         check_memory(output, canvas.size, options.max_memory)
-    composed = OutputImage(
+    laid_out = OutputImage(
         placed=placed,
         canvas=canvas,
         options=run.options,
-        output=None if output is None else Path(output),
-        georeference=place,
-        not_georeferenced=plan.not_georeferenced,
+        output=output,
+        georeference=placement.place,
+        not_georeferenced=placement.reason,
     )
     if run.options.dry_run:
-        return replace(composed, plan=planned(plan.images, canvas, options)), messages
-    plan = plan if plan.decisions is not None else plan.decided(options)
-    assert plan.decisions is not None
-    if plan.photographs:
-        messages += seam_messages(plan.seams, [str(source.path) for source in placed.sources])
+        return replace(laid_out, plan=planned(layout.images, canvas, options)), messages
+    decisions = layout.decide(options)
+    if not placed.tiles:  # which nobody takes for a photograph
+        messages += seam_messages(decisions.quality, [str(source.path) for source in placed.sources])
 
     def report(fraction: float) -> None:
         run.progress("compositing", round(100 * fraction), 100)
 
     def place_of(final: Canvas) -> Georeference | None:
         # Without rounding, where the pixels are those of an earlier output.
-        return place_on_canvas(place, canvas, final) if place is None or placed.grid is None else placed.grid.place
+        if placement.place is not None and placed.grid is not None:
+            return placed.grid.place
+        return place_on_canvas(placement.place, canvas, final)
 
     def tags(final: Canvas) -> list[ExtraTag]:
-        on_final = place_of(final)
-        return [] if on_final is None else on_final.tiff_tags()
+        place = place_of(final)
+        return [] if place is None else place.tiff_tags()
 
     made: Composite | FileComposite
     if output is None:
-        made = composite = compose_decided(plan.decisions, report, run_blocks)
-        composed = replace(composed, composite=composite)
+        made = composite = compose_decided(decisions, report, run_blocks)
+        composed = replace(laid_out, composite=composite)
     else:
         metadata = _metadata(placed.sources[0], options)
         made = written = compose_to_file(
-            output, plan.decisions, report, run_blocks, metadata=metadata, extra_tags=tags, outputs=outputs
+            output, decisions, report, run_blocks, metadata=metadata, extra_tags=tags, outputs=outputs
         )
-        composed = replace(composed, written=written)
+        composed = replace(laid_out, written=written)
     place = place_of(made.canvas)
     messages += made.messages
     if output is not None:
-        messages += [
-            *lost_profile_messages(placed.sources[0], Path(output)),
-            *differing_profile_messages(placed.sources),
-        ]
+        messages += [*lost_profile_messages(placed.sources[0], output), *differing_profile_messages(placed.sources)]
         if place is not None and (files := world_file_paths(output)):
             messages += outputs.attempt(files[0], partial(_write_world_files, outputs, files, place))
-    return replace(composed, canvas=made.canvas, georeference=place, seams=plan.seams), messages
+    return replace(composed, canvas=made.canvas, georeference=place, seams=decisions.quality), messages
 
 
 def _metadata(source: Source, options: CompositeOptions) -> Metadata:

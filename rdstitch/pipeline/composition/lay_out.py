@@ -16,7 +16,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.local_alignment import LocalAlignment, PutativeMatches, align_locally, no_local_alignment
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.pipeline.composition.compose import CanvasPlan
+from rdstitch.pipeline.composition.compose import CanvasLayout, DecidedLayout
 from rdstitch.pipeline.composition.straighten import oriented
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages
@@ -28,18 +28,31 @@ IMAGE_GRID = np.stack(np.meshgrid(*[[0.02, 0.25, 0.5, 0.75, 0.98]] * 2), axis=-1
 
 
 @dataclass(frozen=True)
-class CandidateLayout:
+class RegistrationLayout:
     """A registration in the frame of the output, with its images on a canvas."""
 
     registration: Registration
     local: LocalAlignment
-    plan: CanvasPlan
+    layout: CanvasLayout
     messages: tuple[Message, ...] = ()
+
+    def judged(self, options: CompositeOptions) -> "CandidateLayout":
+        """The same with seams, by which layouts are compared."""
+        layout, decisions = self.layout, self.layout.decide(options)
+        decided = DecidedLayout(layout.placed, layout.canvas, layout.images, layout.placement, decisions)
+        return CandidateLayout(self.registration, self.local, decided, self.messages)
+
+
+@dataclass(frozen=True)
+class CandidateLayout(RegistrationLayout):
+    """A layout that may be chosen, by its seams."""
+
+    layout: DecidedLayout
 
     @property
     def seams(self) -> SeamQuality:
         """What its seams are like."""
-        return self.plan.seams
+        return self.layout.decisions.quality
 
     @cached_property
     def faults(self) -> int:
@@ -48,12 +61,12 @@ class CandidateLayout:
         """
         seams = self.seams
         unjudged = bool(self.local.fields) and not len(seams.places)
-        return int(not seams.seams_fit) + int(is_stretched(self.plan)) + int(seams.mostly_unlike) + int(unjudged)
+        return int(not seams.seams_fit) + int(is_stretched(self.layout)) + int(seams.mostly_unlike) + int(unjudged)
 
     @property
     def clipped(self) -> int:
         """Number of images of which only the near part is drawn."""
-        return sum(part is not None for part in self.plan.canvas.near)
+        return sum(part is not None for part in self.layout.canvas.near)
 
     @property
     def broken(self) -> int:
@@ -103,22 +116,22 @@ def align_registration_locally(
     )
 
 
-def lay_out(registration: Registration, local: LocalAlignment, options: CompositeOptions) -> CandidateLayout:
+def lay_out(registration: Registration, local: LocalAlignment, options: CompositeOptions) -> RegistrationLayout:
     """Images of a registration on the canvas of the output."""
     placed, messages = oriented(PlacedImages.of(registration, local.fields or None), options)
     if placed.orientation is not None:
         homographies = placed.orientation @ registration.alignment.homographies
         registration = replace(registration, alignment=replace(registration.alignment, homographies=homographies))
-    return CandidateLayout(registration, local, CanvasPlan.of(placed, options), tuple(messages))
+    return RegistrationLayout(registration, local, CanvasLayout.of(placed, options), tuple(messages))
 
 
-def is_stretched(plan: CanvasPlan) -> bool:
+def is_stretched(layout: CanvasLayout) -> bool:
     """Whether a plane shows some places much larger than most, or much longer than wide, lens apart."""
-    canvas = plan.canvas
+    canvas = layout.canvas
     if canvas.projection != PLANE:
         return False
     magnification = []
-    for image in plan.images:
+    for image in layout.images:
         size = np.array(image.camera.image_size)
         at, step = IMAGE_GRID * size, 1e-3 * size[1]
         # A fisheye's border is stretched on any plane.

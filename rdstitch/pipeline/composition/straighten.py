@@ -26,7 +26,7 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.planar_motion import nearest_rotation
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.upright_options import UprightOptions
-from rdstitch.pipeline.composition.map_canvas import plan
+from rdstitch.pipeline.composition.map_canvas import output_canvas
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages
 from rdstitch.verification.limits import Limits
@@ -88,7 +88,7 @@ def view_rotation(options: UprightOptions) -> FloatArray | None:
 def _cut_away(placed: PlacedImages, options: CompositeOptions, matrix: FloatArray) -> float:
     """Share of what the images show that has no place in an output that is turned; all, where it has no canvas."""
     with suppress(LimitError):
-        canvas = plan(replace(placed, homographies=matrix @ placed.homographies), options)
+        canvas = output_canvas(replace(placed, homographies=matrix @ placed.homographies), options)
         return canvas.cut_away(placed.cameras, matrix @ placed.homographies)
     return 1.0
 

@@ -49,7 +49,7 @@ def accept(registration: Registration, run: Run) -> Registration:
     The registration comes and goes in pixels of the working size.
     """
     options, purpose = run.options, run.purpose
-    aligner = aligner_of(registration, options, purpose)
+    aligner = aligner_of(registration, run)
     undamaged = None if options.force else _without_damage(registration, aligner, run.guard)
     if undamaged is not None and _is_simpler(undamaged.alignment.model, registration.alignment.model):
         registration, undamaged = undamaged, None

@@ -5,12 +5,11 @@ from dataclasses import replace
 
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.sentences import explain_unaligned
-from rdstitch.choices import Purpose
 from rdstitch.errors import RegistrationError
 from rdstitch.matching.copies import copies_of
 from rdstitch.matching.two_view import Pair, PairRegistration
-from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.registration.aligner import AlignedPairs, Aligner
+from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import names_of
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import Cache
@@ -20,10 +19,10 @@ Rejected = Mapping[tuple[int, ...], str]
 """What is left out, with what is wrong: images (k,), and pairs (i, j) without which other images may fall off."""
 
 
-def aligner_of(registration: Registration, options: StitchOptions, purpose: Purpose) -> Aligner:
+def aligner_of(registration: Registration, run: Run) -> Aligner:
     """What aligns the images of a registration anew."""
-    aligner = Aligner.of(registration.sources, options, Cache.at(options.cache), purpose)
-    return replace(aligner, needs_poses=purpose.poses)
+    aligner = Aligner.of(registration.sources, run.options, Cache.at(run.cache), run.purpose)
+    return replace(aligner, needs_poses=run.purpose.poses)
 
 
 def with_reference_of(registration: Registration, aligner: Aligner) -> Registration:

@@ -10,7 +10,7 @@ from rdstitch.matching.candidate_pairs import loop_closures
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.numerics.robust_loss import sigma_of
-from rdstitch.pipeline.registration.aligner import AlignedPairs, Aligner
+from rdstitch.pipeline.registration.aligner import AlignedPairs, Aligner, DraftedPairs
 
 _ROUNDS = 2  # of registering more pairs and selecting inliers again at most, each by what the one before has shown
 _SETTLED = 0.05  # share of the inliers that must have changed for the images to be aligned again
@@ -22,7 +22,7 @@ _MIN_KEPT = 0.5
 
 def draft_with_loops(
     aligner: Aligner, estimator: PairEstimator, pairs: Sequence[PairRegistration], candidates: Sequence[Pair]
-) -> AlignedPairs:
+) -> DraftedPairs:
     """Draft the alignment, and anew with what a draft shows to be missing: pairs, and inliers.
 
     Those are pairs of images that the poses put beside each other, candidate pairs of images without a pose, and, where

@@ -44,11 +44,11 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
     image that found no place.
     """
     options, purpose, progress = run.options.for_images(len(sources)), run.purpose, run.progress
-    cache = Cache.at(options.cache)
+    cache = Cache.at(run.cache)
     if options.known_distortion is None:
         sources = with_image_circle(sources, executor, cache, run.guard, options.features.limits[1])
     aligner = Aligner.of(sources, options, cache, purpose)
-    store = cache if options.cache is not None else Cache.for_this_run()
+    store = cache if run.cache is not None else Cache.for_this_run()
     with ThreadPoolExecutor(1) as thread:
         thread.submit(import_module, "scipy.sparse.csgraph")  # 0.15 s, which alignments would wait for
         detected = detect_by_contrast(sources, options.features, run, executor, store)
@@ -68,12 +68,12 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
     progress("aligning", 0, 1)
     pairs = [pair for pair in pairs if not {*pair.images} & other_lens.keys()]
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
-    aligned = draft_with_loops(aligner, estimator, pairs, candidates)
+    draft = draft_with_loops(aligner, estimator, pairs, candidates)
     if purpose.poses:
         aligner = replace(aligner, needs_poses=True)
-        aligned = aligner.metric(aligned)
+        draft = aligner.metric(draft)
     progress("aligning", 0, 1)
-    aligned = aligner.completed(aligned)
+    aligned = aligner.completed(draft)
     settle = match_crossings if purpose.lens_only else settle_repeated_pattern
     aligned, undecided = settle(aligner, estimator, aligned, sources, detected.stretch, options.threads)
     unplaced = {**other_lens, **detected.damaged, **undecided}

@@ -1,6 +1,6 @@
 """All files that a run writes: named and checked before its work, staged with its result."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -47,7 +47,7 @@ class PlannedFile:
 
 
 @dataclass(frozen=True)
-class OutputPlan:
+class OutputFiles:
     """Every file that a run writes, and those that it reads."""
 
     run: Run
@@ -61,20 +61,20 @@ class OutputPlan:
     def of_images(
         cls,
         run: Run,
-        inputs: Iterable[str | Path],
+        inputs: Sequence[str | Path],
         names: Sequence[str] = (),
         more_images: Sequence[Path] = (),
         more_files: Sequence[Path] = (),
     ) -> Self:
         """Of a run over images of these names; ``more_images`` may follow its output."""
         images = [*([] if run.output is None else [run.output]), *more_images]
-        return cls(run, [*inputs, *run.read], images, more_files, list(_files_beside(run, names)))
+        return cls(run, inputs, images, more_files, list(_files_beside(run, names)))
 
     @classmethod
     def of_path(
         cls,
         run: Run,
-        inputs: Iterable[str | Path],
+        inputs: Sequence[str | Path],
         output: str | Path | None,
         plot: str | Path | None,
         file_format: TrajectoryFormat,
@@ -86,7 +86,7 @@ class OutputPlan:
             check_bag(files[0], overwrite=run.options.overwrite)
             if files[0].is_dir() and run.options.overwrite:  # as the bags of ROS 2 are
                 replaced = files.pop(0)
-        return cls(run, [*inputs, *run.read], files=files, replaced_bag=replaced)
+        return cls(run, inputs, files=files, replaced_bag=replaced)
 
     def check(self) -> None:
         """Find out before long work whether all can be written, over nothing read."""
