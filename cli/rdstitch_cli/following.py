@@ -48,7 +48,7 @@ def source_to_follow(inputs: Sequence[Path], every: int | None, idle: float | No
 
 def print_followed(frames: "FollowedFrames", reporter: Reporter) -> None:
     """Print a line for each frame as it arrives, until no more come, or the user interrupts."""
-    for note in frames.notes:
+    for note in frames.given.notes:
         reporter.tell(note)
     try:
         with closing(frames.poses):

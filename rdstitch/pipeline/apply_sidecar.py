@@ -20,10 +20,10 @@ from rdstitch.options.option import declared, options_of, with_fields
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.composition.compose import CanvasLayout, compose_images
 from rdstitch.pipeline.composition.straighten import reoriented
-from rdstitch.pipeline.output_files import OutputFiles
-from rdstitch.pipeline.replacements import read_replacements
+from rdstitch.pipeline.inputs.replacements import read_replacements
+from rdstitch.pipeline.outputs.output_files import OutputFiles
+from rdstitch.pipeline.outputs.viewer_pages import plainly_viewed, write_page
 from rdstitch.pipeline.run import RecipeInput, Run
-from rdstitch.pipeline.viewer_pages import plainly_viewed, write_page
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages, SavedGrid
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
@@ -100,7 +100,7 @@ def apply(
 
 
 def settings_of(saved: SavedRegistration, composite: CompositeOptions, options: ApplyOptions) -> StitchOptions:
-    """What the stages after registration take of the options."""
+    """The options of the stages after registration."""
     return StitchOptions(
         composite=composite,
         reference=saved.images[saved.reference].name,
@@ -110,7 +110,7 @@ def settings_of(saved: SavedRegistration, composite: CompositeOptions, options: 
 
 
 def apply_to_images(saved: SavedRegistration, images: FoundImages, run: Run, options: ApplyOptions) -> Recomposition:
-    """Compose images that were found by a saved registration, into memory or among the outputs."""
+    """Compose the images found by a saved registration; with a file as output, stage it."""
     output = run.output
     given = read_replacements(saved, images.frames, options, run.guard, run.options.composite.max_memory)
     placed = saved.record.output.place is not None
@@ -138,7 +138,7 @@ def apply_to_images(saved: SavedRegistration, images: FoundImages, run: Run, opt
 def _laid_out(
     saved: SavedRegistration, sources: Mapping[int, Source], lens: BandLens | None, composite: CompositeOptions
 ) -> tuple[CanvasLayout, list[Message]]:
-    """Where the images lie, by the sidecar and the lens of their band."""
+    """Lay the images out as the sidecar has them, corrected for the lens of their band."""
     if lens is not None:
         sources = {index: replace(source, camera=lens.camera(source.camera)) for index, source in sources.items()}
     placed, of_turn = reoriented(_placed(saved, sources, lens), composite, saved.composite)
@@ -148,7 +148,7 @@ def _laid_out(
 
 
 def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions) -> SavedGrid | None:
-    """The pixels of the saved output, where images of the same sizes are to have the same: bands, and dates."""
+    """The pixel grid of the saved output, if images of the same sizes and options are to be on the same one."""
     matrix, size = saved.plane_to_output, saved.record.output.size
     same_sizes = all(saved.images[index].size == source.camera.image_size for index, source in used.items())
     alike = same_sizes and not saved.turned and options.agrees(saved.composite, CanvasOptions)
@@ -159,7 +159,7 @@ def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: Co
 def _lens_of_band(
     saved: SavedRegistration, used: Mapping[int, Source], progress: Progress
 ) -> tuple[BandLens | None, list[Message]]:
-    """The lens that took the given images, where that is another one than took those that were registered."""
+    """Estimate the lens of the given images, if it is not the one that took the registered images."""
     if saved.record.stage is not None:
         return None, []  # channels of a microscope have their places in common, not their content
     frames = {index: source.frame or Frame(source.path) for index, source in used.items()}
@@ -188,7 +188,7 @@ def _lens_of_band(
 
 
 def _placed(saved: SavedRegistration, used: Mapping[int, Source], lens: BandLens | None) -> PlacedImages:
-    """The images at the places that the sidecar has for them, or that the lens of a band gives them."""
+    """The images with the homographies of the sidecar, corrected for the lens of their band."""
     to_registered = np.eye(3) if lens is None else np.linalg.inv(lens.homography)
     return PlacedImages(
         list(used.values()),

@@ -1,4 +1,4 @@
-"""All bands of a rig of cameras: the first is registered, the lenses of the others to it, and all have one grid."""
+"""Mosaics of all bands of a multispectral rig on one pixel grid: the first band is registered, the others follow."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -25,7 +25,7 @@ from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply_to_images, settings_of
-from rdstitch.pipeline.output_files import file_of_part
+from rdstitch.pipeline.outputs.output_files import file_of_part
 from rdstitch.pipeline.recipes import stitch_images
 from rdstitch.pipeline.run import RecipeInput, Run
 from rdstitch.results.messages import Message
@@ -85,7 +85,7 @@ def mosaic_bands(
 
 
 def _check_alike(bands: Mapping[str, list[Frame]], *, in_one_file: bool, is_ome: bool) -> None:
-    """Refuse before long work bands whose images have other sizes than the first's, or which one file cannot hold."""
+    """Refuse bands whose images differ in size from the first, or that one file cannot hold."""
     kinds = {}
     for name, frames in bands.items():
         sources, unread = read_sources(frames, skip_bad=True)
@@ -110,7 +110,7 @@ def _check_alike(bands: Mapping[str, list[Frame]], *, in_one_file: bool, is_ome:
 
 
 def _stage_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, outputs: Outputs) -> None:
-    """One file of all bands, which are staged; what one of them does not show is transparent."""
+    """Stage one file of all bands, which are staged already; it is transparent where any band is."""
 
     def joined(parts: Sequence[Strip]) -> Strip:
         alphas = [alpha for _, alpha in parts if alpha is not None]
@@ -134,7 +134,7 @@ def _stage_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, out
 
 
 def _by_band(frames: Sequence[Frame], bands: Mapping[str, str]) -> list[list[Frame]]:
-    """The images of each band; none may be of two."""
+    """Assign images to bands; none may belong to two."""
     chosen: dict[str, list[Frame]] = {name: [] for name in bands}
     for frame in frames:
         fitting = [name for name in bands if fnmatchcase(frame.name.rpartition("/")[2].lower(), bands[name].lower())]

@@ -1,4 +1,4 @@
-"""Every block of images that overlap: the largest, and again of what it left out."""
+"""Mosaics of every connected block of images: the largest first, then of what it left out."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ from rdstitch.inputs.selection import selected
 from rdstitch.inputs.times import with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.output_files import file_of_part
+from rdstitch.pipeline.outputs.output_files import file_of_part
 from rdstitch.pipeline.recipes import stitch_images
 from rdstitch.pipeline.run import RecipeInput, Run
 from rdstitch.results.messages import Message
@@ -93,14 +93,14 @@ def _not_used(frames: Sequence[Frame], registration: Registration) -> list[Frame
 
 
 def _for_further_blocks(options: StitchOptions) -> StitchOptions:
-    """Without what is of the first block alone: its camera file, what its reference image shows, patterns of names."""
+    """The options without what concerns the first block alone: camera file, reference image, patterns of names."""
     lines = options.composite.straighten if options.composite.straighten in ("off", "auto") else "off"
     composite = replace(options.composite, rectangle=None, straighten=lines)
     return replace(options, save_camera=None, reference=None, composite=composite, exclude=(), include_only=())
 
 
 def _naming_left_out_once(results: Sequence[StitchResult], messages: Sequence[Message]) -> tuple[StitchResult, ...]:
-    """Blocks of which the first names the images that are in none, and has messages on all."""
+    """The blocks; the first names the images that are in none, and has the messages on all."""
     placed = {str(source.path) for result in results for source in result.placed.sources}
     named = []
     for block, result in enumerate(results):

@@ -23,7 +23,7 @@ from rdstitch.verification.limits import Limits
 
 
 def with_odometry_of_bag(inputs: Iterable[Named], options: StitchOptions) -> StitchOptions:
-    """Options with the odometry of a topic, if one is named, of the bag that is the input."""
+    """The options, with odometry read from the input bag if they name one of its topics."""
     topic = options.odometry
     if topic is None or isinstance(topic, Odometry) or Path(topic).is_file() or not str(topic).startswith("/"):
         return options
@@ -53,7 +53,7 @@ def camera_path(
 def _along_odometry(
     path: Trajectory, sources: Sequence[Source], odometry: Odometry, length_std: float, *, keep_unit: bool
 ) -> tuple[Trajectory, list[Message]]:
-    """The path in the unit of the odometry, unless that is to be kept, with poses of all frames that it leads to."""
+    """Fuse the path with odometry: its unit, unless ``keep_unit``, and poses of frames without one."""
     times = timestamps_of(sources)
     bodies = {k: body for k, time in enumerate(times.tolist()) if (body := odometry.at(time)) is not None}
     if not bodies:
@@ -75,7 +75,7 @@ def _along_odometry(
 
 
 def _scale_uncertainty(alignment: Alignment) -> list[Message]:
-    """A warning where the focal length, and with it the length of every step, is hardly known."""
+    """Warn if the focal length, and with it the scale of the path, is hardly known."""
     if not alignment.length_std > Limits.max_length_std:
         return []
     off = f"all lengths may be off together by {alignment.length_std:.0%}"

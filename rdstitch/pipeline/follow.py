@@ -31,8 +31,8 @@ from rdstitch.inputs.times import time_of, timestamps_of
 from rdstitch.io.opening import check_readable
 from rdstitch.options.option import options_of
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.given_camera import with_camera
-from rdstitch.pipeline.read_inputs import read_frames
+from rdstitch.pipeline.inputs.given_camera import with_camera
+from rdstitch.pipeline.inputs.read_inputs import read_frames
 from rdstitch.pipeline.registration.alignment_inputs import alignment_options
 from rdstitch.pipeline.registration.working_size import at_working_size
 from rdstitch.results.messages import Message
@@ -52,7 +52,7 @@ def follow(
     comes_again: Callable[[Frame], bool] = lambda frame: False,
     preview: LivePreview | None = None,
 ) -> Generator[Pose]:
-    """Register frames as they arrive: a pose for each, and more for those that find their place, or another one, later.
+    """Register frames as they arrive: a pose for each, and another for each frame that is placed or moved later.
 
     Features are fewer than in a recipe, loops are not closed, and memory does not grow with the number of frames.
     ``comes_again`` says whether a frame that could not be read whole will come again.
@@ -95,7 +95,7 @@ class ReadFrame(NamedTuple):
 
 
 class Tracker:
-    """Registers frames of one camera as they come; what :func:`follow` does of one source.
+    """Registers the frames of one camera as they arrive; :func:`follow` does so for a source.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ class Tracker:
 
     @property
     def messages(self) -> tuple[Message, ...]:
-        """What the user should know of all that has come so far."""
+        """What the user should know of all frames so far."""
         return (*self._notes, *self._frames.messages)
 
     def add(
@@ -192,7 +192,7 @@ class Tracker:
         return pose
 
     def read(self, frame: Frame, attitude: Sequence[float] | None = None) -> ReadFrame:
-        """The frame as a source, and as it is tracked; or why it is not."""
+        """Read and prepare a frame for tracking."""
         options, features = self._options, self._detection
         if options.timestamps is not None and (time := time_of(frame, options.timestamps)) is not None:
             frame = replace(frame, timestamp=time)
@@ -217,7 +217,7 @@ class Tracker:
         return [source] if source.attitude is not None else with_attitudes([source], options.attitude)
 
     def register(self, read: ReadFrame, body: BodyPose | None = None) -> list[Pose]:
-        """Register a frame that was read; it comes last, after those before it whose place is new."""
+        """Register a frame that was read; its pose comes last, after those of earlier frames that changed."""
         source, image = read.source, read.image
         label = Pose(read.frame.name, read.frame.number or 0, math.nan, TrackingResult(), read.problem, self._poses)
         if source is None or image is None:
@@ -232,7 +232,7 @@ class Tracker:
         return self._poses_of(results)
 
     def finish(self) -> tuple[Pose, ...]:
-        """Poses of frames that find their place, or another one, when no other frame comes."""
+        """Poses of the frames that are placed or moved once no more frames arrive."""
         return tuple(self._poses_of(self._frames.finish()))
 
     def _poses_of(self, results: Sequence[TrackingResult]) -> list[Pose]:

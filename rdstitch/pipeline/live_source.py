@@ -1,7 +1,7 @@
 """Frames followed as they arrive, before a recipe registers all of them together."""
 
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -13,9 +13,8 @@ from rdstitch.inputs.frame_stream import open_frame_stream
 from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.follow import follow
-from rdstitch.pipeline.output_files import OutputFiles
+from rdstitch.pipeline.outputs.output_files import OutputFiles
 from rdstitch.pipeline.run import RecipeInput, Run
-from rdstitch.results.messages import Message
 from rdstitch.results.pose import FollowedPoses, Pose
 from rdstitch.system.file_access import file_state
 from rdstitch.system.temporary_folder import TemporaryFolder
@@ -40,35 +39,33 @@ class LiveSource:
 
 @dataclass(frozen=True)
 class FollowedFrames:
-    """Poses of the frames of a source, and what a recipe takes once they have ended."""
+    """The frames of a source that is followed."""
 
-    poses: Generator[Pose]
-    images: Sequence[Named]  # all that have arrived
-    options: StitchOptions  # with the camera that was read
-    notes: Sequence[Message]  # on the camera
+    poses: Generator[Pose]  # of each as it arrives
+    images: Sequence[Named]  # all that have arrived, for a recipe
+    given: RecipeInput  # what was read of camera and odometry
 
 
 @contextmanager
 def follow_for_mosaic(
     source: LiveSource, output: Path, options: StitchOptions, beside: FilesBeside, *, refresh: float
 ) -> Iterator[FollowedFrames]:
-    """Follow a source before :func:`rdstitch.mosaic`, which replaces the preview that is written meanwhile.
+    """Follow a source before :func:`rdstitch.mosaic`, whose output replaces a preview.
 
     The preview is written every ``refresh`` seconds at most, not at all for 0.
     """
     source.refuse_in_folder(output)
     given = RecipeInput.of([source.name], options, Purpose.MOSAIC, source.every)
     run, preview = Run.of(given, output, beside), output.with_suffix(".preview.jpg")
-    files = OutputFiles.of_images(run, [source.name], more_files=[preview] if refresh else [])
+    files = OutputFiles.of_images(run, [source.name, *given.files], more_files=[preview] if refresh else [])
     before = file_state(preview)
-    with _followed(source, given, files, FollowedPoses(), LivePreview(preview, refresh) if refresh else None) as frames:
+    with _followed(source, given, files, preview=LivePreview(preview, refresh) if refresh else None) as frames:
         yield frames
     # The image that it was a preview of is there now; a file that was not replaced is the user's.
     if refresh and file_state(preview) != before:
         preview.unlink(missing_ok=True)
 
 
-@contextmanager
 def follow_for_trajectory(
     source: LiveSource,
     output: Path,
@@ -77,29 +74,32 @@ def follow_for_trajectory(
     *,
     plot: Path | None,
     file_format: TrajectoryFormat,
-) -> Iterator[FollowedFrames]:
+) -> AbstractContextManager[FollowedFrames]:
     """Follow a source before :func:`rdstitch.trajectory`."""
     source.refuse_in_folder(output)
     given = RecipeInput.of([source.name], options, Purpose.TRAJECTORY, source.every)
-    files = OutputFiles.of_path(Run.of(given), [source.name], output, plot, file_format)
-    with _followed(source, given, files, poses, None) as frames:
-        yield frames
+    files = OutputFiles.of_path(Run.of(given), [source.name, *given.files], output, plot, file_format)
+    return _followed(source, given, files, poses)
 
 
 @contextmanager
 def _followed(
-    source: LiveSource, given: RecipeInput, files: OutputFiles, poses: FollowedPoses, preview: LivePreview | None
+    source: LiveSource,
+    given: RecipeInput,
+    files: OutputFiles,
+    poses: FollowedPoses | None = None,
+    preview: LivePreview | None = None,
 ) -> Iterator[FollowedFrames]:
     with files.run.outputs:
         files.check()
-    with TemporaryFolder() as kept:
+    with TemporaryFolder() as folder:
         arrivals = open_frame_stream(
             source.name,
-            frames_folder=lambda: kept,
+            frames_folder=lambda: folder,
             names=source.names,
             every=source.every or 1,
             idle=source.idle,
             topic=given.options.topic,
         )
         followed = follow(arrivals, given.options, poses, comes_again=arrivals.comes_again, preview=preview)
-        yield FollowedFrames(followed, arrivals.inputs, given.options, given.notes)
+        yield FollowedFrames(followed, arrivals.inputs, given)

@@ -26,15 +26,15 @@ from rdstitch.pipeline.composition.choose_layout import choose_layout
 from rdstitch.pipeline.composition.compose import compose_images
 from rdstitch.pipeline.composition.lay_out import RegistrationLayout
 from rdstitch.pipeline.composition.map_canvas import check_map
-from rdstitch.pipeline.output_files import OutputFiles, report_refused, save_camera, stage_report
-from rdstitch.pipeline.read_inputs import in_order, read_inputs
+from rdstitch.pipeline.inputs.read_inputs import in_order, read_inputs
+from rdstitch.pipeline.outputs.output_files import OutputFiles, report_refused, save_camera, stage_report
+from rdstitch.pipeline.outputs.viewer_pages import viewed_images, write_page
 from rdstitch.pipeline.registration.accept import accept
 from rdstitch.pipeline.registration.realign import aligner_of, with_reference_of
 from rdstitch.pipeline.registration.register import register
 from rdstitch.pipeline.registration.working_size import at_full_size
 from rdstitch.pipeline.run import RecipeInput, Run
 from rdstitch.pipeline.run_on_sources import blocks_on
-from rdstitch.pipeline.viewer_pages import viewed_images, write_page
 from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
@@ -142,7 +142,7 @@ def _stitch(given: RecipeInput, output: str | Path | None, beside: FilesBeside, 
 def stitch_images(
     images: FoundImages, run: Run, *, more_images: Sequence[Path] = (), more_files: Sequence[Path] = ()
 ) -> StitchResult:
-    """Stitch images that were found into an output of a run; more images, and files, may be written after it."""
+    """Stitch images into the output of a run; ``more_images`` and ``more_files`` may be written after it."""
     options = run.options
     frames = in_order(with_times(images.frames, options.timestamps))
     names = [frame.name for frame in selected(frames, options.exclude, options.include_only)]
@@ -198,7 +198,7 @@ def trajectory(
     output: str | Path | None = None,
     options: StitchOptions | None = None,
     *,
-    layout: TrajectoryFormat = "csv",
+    file_format: TrajectoryFormat = "csv",
     plot: str | Path | None = None,
     height: float | None = None,
     frame: TrajectoryFrame | None = None,
@@ -213,7 +213,7 @@ def trajectory(
         As for :func:`mosaic`, but that every frame of a video is used unless ``every`` says otherwise.
     output : path, optional
         File to write.
-    layout : str
+    file_format : str
         "csv", "tum" or "kitti", see :mod:`rdstitch.export.trajectory_files`; "bag": ``nav_msgs/Odometry``, see
         :mod:`rdstitch.export.write_trajectory`.
     plot : path, optional
@@ -229,22 +229,22 @@ def trajectory(
     Trajectory, Registration
         The path, and the registration that it comes from.
     """
-    for name, kind, value in (("layout", TrajectoryFormat, layout), ("height", Height, height)):
+    for name, kind, value in (("file_format", TrajectoryFormat, file_format), ("height", Height, height)):
         check_parameter(name, kind, value)
     check_parameter("frame", TrajectoryFrame | None, frame)
     given = RecipeInput.of(inputs, options, Purpose.TRAJECTORY, every)
     run = Run.of(given, progress=progress)
     with given.find_images() as images, run.outputs:
-        OutputFiles.of_path(run, images.files, output, plot, layout).check()
+        OutputFiles.of_path(run, images.files, output, plot, file_format).check()
         odometry = as_odometry(run.options.odometry)
         numbers = frame_numbers(images.frames)
         numbered = [replace(frame, number=k) for frame, k in zip(images.frames, numbers, strict=True)]
         registration = _register_at_full_size(replace(images, frames=numbered), run)
         path, messages = camera_path(registration, odometry, height)
-        if layout in ("tum", "bag") and not has_times(path):
+        if file_format in ("tum", "bag") and not has_times(path):
             messages.append(_NO_TIMES)
         if output is not None:
-            write_trajectory(path, Path(output), layout, frame, run.outputs)
+            write_trajectory(path, Path(output), file_format, frame, run.outputs)
         save_camera(registration, run)
         if plot is not None:
             drawn = text_bytes(path_as_svg(path, "heights" if height is None else "m"))
@@ -253,7 +253,7 @@ def trajectory(
 
 
 def _register_at_full_size(images: FoundImages, run: Run) -> Registration:
-    """The registration of images that were found, in pixels of their full size."""
+    """Register images, in pixels of their full size."""
     frames = with_times(images.frames, run.options.timestamps)
     sources, unread = read_inputs(frames, run.options, run.guard, skip_bad=True)
     with run.executor(len(sources)) as executor, _failures_explained(run, unread):
@@ -263,7 +263,7 @@ def _register_at_full_size(images: FoundImages, run: Run) -> Registration:
 
 @contextmanager
 def _failures_explained(run: Run, unread: Sequence[Message]) -> Iterator[None]:
-    """Failures of the block name what could not be read well; of a result that is refused the report is written."""
+    """Add unreadable and damaged images to the text of a failure in the block; write the report of a refused result."""
     try:
         yield
     except RegistrationError as error:
@@ -277,9 +277,9 @@ def _failures_explained(run: Run, unread: Sequence[Message]) -> Iterator[None]:
 def _register_and_check(
     sources: Sequence[Source], known: Sequence[Message], run: Run, executor: Executor
 ) -> tuple[Registration, Run]:
-    """Register and check, in pixels of the working size; with the reference image that the run has then.
+    """Register and check, in pixels of the working size; and the run, whose reference image is now known.
 
-    Where that shall be the first image, it is the first of those that are used.
+    If it shall be the first image, it is the first of those used.
     """
     if run.beside.frame == "first":
         run = run.with_reference(sources[0])
@@ -294,7 +294,7 @@ def _register_and_check(
 
 
 def compose_registration(chosen: RegistrationLayout, run: Run, files: OutputFiles, executor: Executor) -> StitchResult:
-    """Compose images at the places of a registration, into memory or among the outputs, with all that belongs to it."""
+    """Compose the layout of a registration and stage all files that belong to the output."""
     registration, options, outputs = chosen.registration, run.options, run.outputs
     run_blocks = blocks_on(executor, chosen.layout.placed.sources, run.guard, run.cache)
     composed, messages = compose_images(chosen.layout, run, run_blocks)
@@ -316,7 +316,7 @@ def compose_registration(chosen: RegistrationLayout, run: Run, files: OutputFile
 
 
 def _release_images(registration: Registration, run: Run) -> Registration:
-    """Images kept for stages that will not come are let go; what the decoders found wrong, in any stage, is added."""
+    """Release decoded images, and add messages on damaged files."""
     for source in registration.sources:
         source.decoded_images.clear()
     return registration.with_messages(run.guard.messages)

@@ -21,7 +21,7 @@ from rdstitch.options.option import check_parameter, options_of
 from rdstitch.options.shared_options import Every
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.camera_path import with_odometry_of_bag
-from rdstitch.pipeline.given_camera import with_camera
+from rdstitch.pipeline.inputs.given_camera import with_camera
 from rdstitch.results.messages import Message
 from rdstitch.system.outputs import Outputs
 from rdstitch.system.progress import Progress, StageTimer, silent

@@ -1,4 +1,4 @@
-"""Places of tiles in the form that everything after registration takes."""
+"""Converting registered tiles to a :class:`Registration`, which later stages take."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -22,7 +22,7 @@ from rdstitch.stage.register_tiles import TileRegistration
 
 
 def tiles_as_registration(sources: Sequence[Source], tiled: TileRegistration) -> Registration:
-    """What was found, in the form that everything after registration takes."""
+    """Convert registered tiles to a registration."""
     fitted, links = tiled.adjustment, tiled.links
     if not tiled.linked.any():
         raise RegistrationError(
@@ -89,7 +89,7 @@ def _pair(
 
 
 def _messages(sources: Sequence[Source], tiled: TileRegistration) -> tuple[Message, ...]:
-    """What the user should know of the places."""
+    """Messages on the places."""
     fitted = tiled.adjustment
 
     def named(tiles: Iterable[int]) -> str:

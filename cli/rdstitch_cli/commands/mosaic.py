@@ -105,7 +105,7 @@ def mosaic(
         source = source_to_follow(inputs, every, idle)
         with follow_for_mosaic(source, output, options, beside, refresh=refresh) as frames:
             print_followed(frames, reporter)
-            result = recipe(frames.images, output, frames.options, **how)
+            result = recipe(frames.images, output, frames.given.options, **how)
             if as_json:
                 report_result(result, reporter, as_json=True)
             else:

@@ -62,7 +62,7 @@ def trajectory(
     from rdstitch.pipeline.recipes import trajectory as recipe
 
     options = stitch_options(given)
-    how: dict[str, Any] = {"layout": file_format, "plot": plot, "height": height, "frame": frame, "every": every}
+    how: dict[str, Any] = {"file_format": file_format, "plot": plot, "height": height, "frame": frame, "every": every}
     if following:
         from rdstitch.pipeline.live_source import follow_for_trajectory
         from rdstitch.results.pose import FollowedPoses
@@ -70,7 +70,7 @@ def trajectory(
         source, poses = source_to_follow(inputs, every, idle), FollowedPoses(height, frame or frame_of(file_format))
         with follow_for_trajectory(source, output, options, poses, plot=plot, file_format=file_format) as frames:
             print_followed(frames, reporter)
-            _, registration = recipe(frames.images, output, frames.options, progress=reporter, **how)
+            _, registration = recipe(frames.images, output, frames.given.options, progress=reporter, **how)
             print_result(registration, reporter, output)
     else:
         _, registration = recipe(resolve(inputs), output, options, progress=reporter, **how)

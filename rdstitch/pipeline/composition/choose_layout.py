@@ -18,6 +18,7 @@ import numpy as np
 from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.result import Alignment
+from rdstitch.alignment.whole_pixels import on_whole_pixels
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.choices import ModelName, Purpose
 from rdstitch.compositing.seam_quality import DIAGONAL
@@ -36,7 +37,6 @@ from rdstitch.pipeline.composition.lay_out import (
 )
 from rdstitch.pipeline.registration.aligner import Aligner
 from rdstitch.pipeline.registration.realign import by_second_motions, plane_of_most, realigned
-from rdstitch.pipeline.registration.whole_pixels import on_whole_pixels
 from rdstitch.pipeline.registration.working_size import at_full_size
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
@@ -67,7 +67,8 @@ class _Trials:
     def lay_out(self, registration: Registration, local: LocalAlignment | None = None) -> RegistrationLayout:
         """Lay out a registration in pixels of the working size."""
         options = self.options
-        whole = on_whole_pixels(_with_frontal_reference(at_full_size(registration), options, always=self.pano))
+        whole = _with_frontal_reference(at_full_size(registration), options, always=self.pano)
+        whole = replace(whole, alignment=on_whole_pixels(whole.alignment, whole.pairs))
         if local is None:
             local = align_registration_locally(whole, options.local_alignment, self.edges_of, options.threads)
         return lay_out(whole, local, options.composite)
@@ -84,7 +85,7 @@ class _Trials:
 
 
 def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner) -> RegistrationLayout:
-    """The layout whose seams hold, or break the least; of a panorama always in the frame of an image.
+    """Choose the layout whose seams hold, or break least; that of a panorama is in the frame of an image.
 
     Pixels are those of the working size.
     """
@@ -131,7 +132,7 @@ def _with_frontal_reference(registration: Registration, options: StitchOptions, 
 def _plane_behind(
     registration: Registration, first: CandidateLayout | None, trials: _Trials, aligner: Aligner
 ) -> tuple[Registration, CandidateLayout | None]:
-    """The plane behind what moves of its own, with its layout, where its images look more alike; else what is given."""
+    """The plane behind moving objects, with its layout, if its images look more alike; else what is given."""
     plane = plane_of_most(registration, aligner, trials.options.threads)
     if plane is None or not _joins(plane, registration, aligner.threshold):
         return registration, first
@@ -145,7 +146,7 @@ def _plane_behind(
 def _alternatives(
     registration: Registration, first: CandidateLayout | None, trials: _Trials, aligner: Aligner
 ) -> Iterator[CandidateLayout]:
-    """Other layouts, the likeliest first, where something speaks against the first one, or it has no canvas."""
+    """Alternative layouts, likeliest first, if the first has faults or no canvas."""
     if first is not None:
         if not first.faults:
             return
@@ -163,7 +164,7 @@ def _alternatives(
 def _other_surface(
     registration: Registration, first: CandidateLayout, trials: _Trials, aligner: Aligner
 ) -> CandidateLayout | None:
-    """By the second motion of the images whose seams break; None where no more of them looks alike then."""
+    """The layout by the second motion of the images whose seams break; None if they do not look more alike."""
     used = np.flatnonzero(registration.alignment.used).tolist()
     broken = [(used[one.images[0]], used[one.images[1]]) for one in first.seams.misfits]
     other = by_second_motions(registration, broken, aligner)
@@ -177,7 +178,7 @@ def _other_surface(
 
 
 def _least_broken(tried: Sequence[CandidateLayout], *, keep_first: bool) -> CandidateLayout:
-    """The layout that the least speaks against; or else the first, unless another is clearly better."""
+    """The layout with the fewest faults; or the first, unless another is clearly better."""
     first = tried[0]
     best = min((one for one in tried if one.clipped <= first.clipped), key=lambda one: (one.faults, one.broken))
     broken = 0 if first.seams.seams_fit else first.broken
@@ -188,7 +189,7 @@ def _least_broken(tried: Sequence[CandidateLayout], *, keep_first: bool) -> Cand
 def _other_models(
     registration: Registration, first: CandidateLayout | None, options: StitchOptions, aligner: Aligner
 ) -> Iterator[Registration]:
-    """The same images aligned by other models, where every one finds its place."""
+    """The images aligned by other motion models, if each still finds its place."""
     alignment = registration.alignment
     # What breaks along seams may have moved, and proves nothing against a layout that fits; one that is stretched does.
     stretched = first is None or is_stretched(first.layout)
@@ -205,8 +206,9 @@ def _other_models(
 
 
 def _joins(other: Registration, first: Registration, allowed: float) -> bool:
-    """Whether another registration uses all images of one, with errors that are allowed: local alignment makes seams
-    hold that nothing else does.
+    """Whether another registration uses all images of the first, with errors up to ``allowed``, pixels.
+
+    Without this limit local alignment would make the seams of any registration hold.
     """
     return bool((other.alignment.used >= first.alignment.used).all()) and _error(other) <= allowed
 
@@ -226,7 +228,7 @@ def _error(registration: Registration) -> float:
 
 
 def _differs(registration: Registration, allowed: float, other: Alignment, *, stretched: bool) -> bool:
-    """Whether another alignment can have other seams: it joins the images, and puts them elsewhere on each other."""
+    """Whether another alignment can change the seams: it joins the images and moves their overlaps."""
     alignment = registration.alignment
     if not _joins(replace(registration, alignment=other), registration, allowed):
         return False

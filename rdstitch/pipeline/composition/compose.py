@@ -1,4 +1,4 @@
-"""The last stage of every image: from registered images to pixels, in memory or in a file with a page beside it."""
+"""The last stage of every recipe: registered images become pixels, in memory or in a file."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,10 +10,8 @@ import numpy as np
 
 from rdstitch.compositing import (
     Canvas,
-    Composite,
     CompositeOptions,
     Decisions,
-    FileComposite,
     PlacedImage,
     compose_decided,
     compose_to_file,
@@ -30,7 +28,7 @@ from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.options.upright_options import Corners
 from rdstitch.pipeline.composition.map_canvas import canvas_on_map, place_on_canvas
-from rdstitch.pipeline.output_messages import (
+from rdstitch.pipeline.composition.output_messages import (
     cut_away_messages,
     differing_profile_messages,
     lost_profile_messages,
@@ -67,6 +65,12 @@ class CanvasLayout:
         """Decide on exposure, seams and crop of the images, on small versions of them."""
         return decide(self.images, self.canvas, options)
 
+    def place_of(self, final: Canvas) -> Georeference | None:
+        """The place of the final canvas on the Earth."""
+        place, grid = self.placement.place, self.placed.grid
+        # Without rounding, where the pixels are those of an earlier output.
+        return grid.place if place is not None and grid is not None else place_on_canvas(place, self.canvas, final)
+
 
 @dataclass(frozen=True)
 class DecidedLayout(CanvasLayout):
@@ -82,19 +86,15 @@ class DecidedLayout(CanvasLayout):
 def compose_images(
     layout: CanvasLayout, run: Run, run_blocks: BlockRunner | None = None
 ) -> tuple[OutputImage, list[Message]]:
-    """Put images on a canvas, in memory or into a file that can hold it, of a dry run plan it; and what to know of it.
+    """Compose images on their canvas, in memory or into a file, or plan that in a dry run; with messages.
 
     A file has colour profile and EXIF of the first image, and its place on the Earth. ``run_blocks``: see
     :func:`rdstitch.compositing.compose_decided`.
     """
     return_freed_memory()
-    options, outputs = run.options.compositing, run.outputs
-    placed, canvas, placement, output = layout.placed, layout.canvas, layout.placement, run.output
-    messages = [
-        *masked_messages(placed),
-        *place_messages(placement, placed),
-        *cut_away_messages(placed, canvas, options),
-    ]
+    options, output = run.options.compositing, run.output
+    placed, canvas, placement = layout.placed, layout.canvas, layout.placement
+    messages = masked_messages(placed) + place_messages(placement, placed) + cut_away_messages(placed, canvas, options)
     # A crop may yet make it fit.
     if output is not None and options.crop == "none":
         check_size(output, canvas.size)
@@ -110,43 +110,42 @@ def compose_images(
     if run.options.dry_run:
         return replace(laid_out, plan=planned(layout.images, canvas, options)), messages
     decisions = layout.decide(options)
-    if not placed.tiles:  # which nobody takes for a photograph
+    if not placed.tiles:  # seams are judged as seen in a photograph
         messages += seam_messages(decisions.quality, [str(source.path) for source in placed.sources])
+    composed, of_output = _drawn(replace(laid_out, seams=decisions.quality), layout, decisions, run, run_blocks)
+    return composed, [*messages, *of_output]
+
+
+def _drawn(
+    laid_out: OutputImage, layout: CanvasLayout, decisions: Decisions, run: Run, run_blocks: BlockRunner | None
+) -> tuple[OutputImage, list[Message]]:
+    """Draw the image, in memory or into a file with its world files."""
+    outputs, output, sources = run.outputs, run.output, layout.placed.sources
 
     def report(fraction: float) -> None:
         run.progress("compositing", round(100 * fraction), 100)
 
-    def place_of(final: Canvas) -> Georeference | None:
-        # Without rounding, where the pixels are those of an earlier output.
-        if placement.place is not None and placed.grid is not None:
-            return placed.grid.place
-        return place_on_canvas(placement.place, canvas, final)
-
     def tags(final: Canvas) -> list[ExtraTag]:
-        place = place_of(final)
+        place = layout.place_of(final)
         return [] if place is None else place.tiff_tags()
 
-    made: Composite | FileComposite
     if output is None:
-        made = composite = compose_decided(decisions, report, run_blocks)
-        composed = replace(laid_out, composite=composite)
-    else:
-        metadata = _metadata(placed.sources[0], options)
-        made = written = compose_to_file(
-            output, decisions, report, run_blocks, metadata=metadata, extra_tags=tags, outputs=outputs
-        )
-        composed = replace(laid_out, written=written)
-    place = place_of(made.canvas)
-    messages += made.messages
-    if output is not None:
-        messages += [*lost_profile_messages(placed.sources[0], output), *differing_profile_messages(placed.sources)]
-        if place is not None and (files := world_file_paths(output)):
-            messages += outputs.attempt(files[0], partial(_write_world_files, outputs, files, place))
-    return replace(composed, canvas=made.canvas, georeference=place, seams=decisions.quality), messages
+        image = compose_decided(decisions, report, run_blocks)
+        place = layout.place_of(image.canvas)
+        return replace(laid_out, composite=image, canvas=image.canvas, georeference=place), [*image.messages]
+    metadata = _metadata(sources[0], run.options.compositing)
+    written = compose_to_file(
+        output, decisions, report, run_blocks, metadata=metadata, extra_tags=tags, outputs=outputs
+    )
+    place = layout.place_of(written.canvas)
+    messages = [*written.messages, *lost_profile_messages(sources[0], output), *differing_profile_messages(sources)]
+    if place is not None and (files := world_file_paths(output)):
+        messages += outputs.attempt(files[0], partial(_write_world_files, outputs, files, place))
+    return replace(laid_out, written=written, canvas=written.canvas, georeference=place), messages
 
 
 def _metadata(source: Source, options: CompositeOptions) -> Metadata:
-    """That of the output, as of its first image; its pixels have another size where they were scaled."""
+    """Metadata of the output: that of the first image, with the pixel size as scaled."""
     metadata = source.metadata.of_composite()
     if metadata.pixel_size is None:
         return metadata
@@ -154,7 +153,7 @@ def _metadata(source: Source, options: CompositeOptions) -> Metadata:
 
 
 def _box_of_rectangle(placed: PlacedImages, corners: Corners, canvas: Canvas) -> Box | None:
-    """Where the rectangle that the user has named lies on the canvas; None where its corners have no place there."""
+    """Box of the user's rectangle on the canvas; None if its corners lie outside."""
     index = placed.reference
     if index is None:
         return None

@@ -1,4 +1,4 @@
-"""Stages: images of a registration, aligned locally, on the canvas of the output; and what speaks against it."""
+"""Stages: local alignment, and the layout of a registration on the canvas of the output, with its faults."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -56,9 +56,7 @@ class CandidateLayout(RegistrationLayout):
 
     @cached_property
     def faults(self) -> int:
-        """What speaks against it: seams that do not fit, stretched places, overlaps that do not look alike, and local
-        alignment whose seams lie nowhere where they could be judged, 0 to 4.
-        """
+        """Number of faults, 0 to 4: misfitting seams, stretching, unlike overlaps, unjudged local alignment."""
         seams = self.seams
         unjudged = bool(self.local.fields) and not len(seams.places)
         return int(not seams.seams_fit) + int(is_stretched(self.layout)) + int(seams.mostly_unlike) + int(unjudged)
@@ -70,7 +68,7 @@ class CandidateLayout(RegistrationLayout):
 
     @property
     def broken(self) -> int:
-        """Number of places at which its seams do not fit; they are as far apart in every layout."""
+        """Number of places at which its seams do not fit; places are equally spaced in every layout."""
         return int(self.seams.misfit.sum())
 
 
@@ -85,7 +83,7 @@ def align_registration_locally(
     edges: Callable[[int], FloatArray] | None = None,
     threads: int = 1,
 ) -> LocalAlignment:
-    """Displacement fields of the images that are used, in their order, from the matches of all their pairs.
+    """Estimate displacement fields of the images used, in their order, from the matches of all pairs.
 
     ``edges`` are those of an image that fields should not bend.
     """
@@ -117,7 +115,7 @@ def align_registration_locally(
 
 
 def lay_out(registration: Registration, local: LocalAlignment, options: CompositeOptions) -> RegistrationLayout:
-    """Images of a registration on the canvas of the output."""
+    """Lay the images of a registration out on the canvas of the output."""
     placed, messages = oriented(PlacedImages.of(registration, local.fields or None), options)
     if placed.orientation is not None:
         homographies = placed.orientation @ registration.alignment.homographies
@@ -126,7 +124,7 @@ def lay_out(registration: Registration, local: LocalAlignment, options: Composit
 
 
 def is_stretched(layout: CanvasLayout) -> bool:
-    """Whether a plane shows some places much larger than most, or much longer than wide, lens apart."""
+    """Whether a plane magnifies some places much more than most, or stretches them in one direction, lens aside."""
     canvas = layout.canvas
     if canvas.projection != PLANE:
         return False

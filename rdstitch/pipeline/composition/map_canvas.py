@@ -1,4 +1,4 @@
-"""The canvas of images; of georeferenced ones north up, and of the ground sample distance that was requested."""
+"""The canvas of the output; north up, with the requested ground sample distance, if it is georeferenced."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -22,7 +22,7 @@ _SAME_PIXELS = 1e-6  # pixels that two grids may be off: rounding
 
 
 def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:
-    """Find out before long work whether what is requested of the map can be had."""
+    """Refuse early what the options request of a map without a known place."""
     if options.epsg is not None:
         Crs(options.epsg)
     if options.like is not None:
@@ -51,7 +51,7 @@ def output_canvas(placed: PlacedImages, options: CompositeOptions) -> Canvas:
 
 
 def _canvas(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canvas:
-    """The canvas on a plane, or, of images taken by turning on the spot, in a projection."""
+    """The canvas on a plane or, for a pure rotation, in a projection."""
     if not placed.turned and options.projection not in ("auto", "plane"):
         raise ArgumentError(
             f"the {options.projection} projection is for images taken by turning on the spot; these were not, "
@@ -128,7 +128,7 @@ def _grid(options: CompositeOptions, place: Georeference) -> MapGrid | None:
 
 
 def _on_saved_grid(canvas: Canvas, placed: PlacedImages, grid: SavedGrid, *, cropped: bool) -> Canvas:
-    """The canvas of which a crop leaves the pixels of an earlier output; these alone, where it does not hold them."""
+    """The canvas cropped to the pixels of an earlier output; exactly these pixels if it does not cover them."""
     to_grid = grid.from_plane @ np.linalg.inv(canvas.matrix)
     left, top = np.rint(-to_grid[:2, 2]).astype(int).tolist()
     shift = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top], [0.0, 0.0, 1.0]])

@@ -1,4 +1,4 @@
-"""Stages: registered pairs become one alignment, which finds more pairs, which make a better alignment."""
+"""Stage: the alignment of all images by their registered pairs, as a draft and complete."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -35,7 +35,7 @@ _EXPLAINED = 0.5
 
 @contextmanager
 def impossible_estimates_fail() -> Iterator[None]:
-    """An estimated camera that cannot be is a failed registration; a block, or a decorator of a stage."""
+    """Turn errors of an impossible estimate into a RegistrationError; as a block, or decorator of a stage."""
     try:
         yield
     except np.linalg.LinAlgError as error:
@@ -68,7 +68,7 @@ class DraftedPairs(AlignedPairs):
 
 @dataclass(frozen=True)
 class _DistinctTask:
-    """What is aligned: the evidence among some pairs."""
+    """An alignment task, with the pairs that its evidence was chosen from."""
 
     pairs: Sequence[PairRegistration]
     distinct: DistinctPairs
@@ -91,7 +91,7 @@ class Aligner:
     def of(
         cls, sources: Sequence[Source], options: StitchOptions, cache: Cache, purpose: Purpose = Purpose.MOSAIC
     ) -> Self:
-        """From what the user decided, and what the images and their headers say; see :class:`AlignmentOptions`."""
+        """From options, images and their headers; see :class:`AlignmentOptions`."""
         paths = tuple(str(source.path) for source in sources)
         megapixels = options.features.for_images(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_guessed_focal(), megapixels) for source in sources)
@@ -108,7 +108,7 @@ class Aligner:
         return [(psi, theta) for psi, theta in self.quarters.tilts(np.array(tilts)).tolist()]
 
     def align(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
-        """Align the images by the pairs that were registered; from an earlier run where the cache has it."""
+        """Align the images by their registered pairs."""
         return self.completed(self.draft(pairs))
 
     def draft(self, pairs: Sequence[PairRegistration], known: KnownModel | None = None) -> DraftedPairs:
@@ -138,8 +138,9 @@ class Aligner:
     def _explains(
         self, alignment: Alignment, pairs: Sequence[PairRegistration], ground: Sequence[PairRegistration]
     ) -> bool:
-        """Whether most matches off the planes of their pairs are where an alignment without them expects them: it knows
-        more of the lens than a pair does; and near a camera that turns is no ground.
+        """Whether an alignment predicts most matches that rough ground would add: then it was the lens, not the ground.
+
+        A camera that turns on the spot has no ground near it.
         """
         errors = [np.zeros(0)]
         for pair, more in zip(pairs, ground, strict=True):
@@ -152,7 +153,7 @@ class Aligner:
     def _drafted(
         self, pairs: Sequence[PairRegistration], known: KnownModel | None = None, counted: frozenset[int] = frozenset()
     ) -> DraftedPairs:
-        """The images aligned; near copies are placed afterwards, but for those that are ``counted`` as all are."""
+        """Draft the alignment; near copies are placed afterwards, except those ``counted`` as evidence."""
         if not any(pair.relation for pair in pairs):
             raise RegistrationError(_no_overlap(self.paths, pairs))
         distinct = DistinctPairs.of(pairs, self.options, self.quarters, counted)
@@ -167,7 +168,7 @@ class Aligner:
         return DraftedPairs(tuple(pairs), draft, rough=False, task=of_distinct, known=draft_model)
 
     def _of_all_images(self, alignment: Alignment, of_distinct: _DistinctTask) -> Alignment:
-        """What comes of a task, upright, with copies where their images lie."""
+        """The alignment of a task as that of all upright images, copies included."""
         distinct = of_distinct.distinct
         alignment = self._upright(alignment, of_distinct.task)
         compared = [distinct.registered[ends].images for ends in distinct.evidence]
@@ -182,7 +183,7 @@ class Aligner:
         return alignment.with_messages([Message(text, severity="detail", code="copies")])
 
     def _task(self, distinct: DistinctPairs) -> AlignmentTask:
-        """What is aligned: images as they are stored, cut ones in a frame that holds each of them."""
+        """The task of aligning images as they are stored; images cut to several sizes in a common frame."""
         stored, count = self.quarters.back, len(distinct.evidence)
         cameras = tuple(stored.camera(camera, k) for k, camera in enumerate(self.cameras))
         most = most_matches_read(count, self.options)
@@ -197,13 +198,13 @@ class Aligner:
         return AlignmentTask(cameras, links[:count], distinct.options, distinct.near_copies, links[count:])
 
     def _recalled(self, stage: str, task: AlignmentTask, compute: Callable[[], Computed]) -> Computed:
-        """What comes of a task; from an earlier run where the cache has it."""
+        """A result of a task, from the cache if it is there."""
         of_links = (task.links, task.links_of_copies, sorted(task.near_copies.items()))
         inputs = (task.cameras, self.cache.digest(of_links), task.options, task.known)
         return self.cache.recall(stage, inputs, compute)
 
     def _upright(self, alignment: Alignment, task: AlignmentTask) -> Alignment:
-        """An alignment of the images as they are stored as one of the upright images, each of its own size."""
+        """Convert an alignment of stored images to one of upright images, each of its own size."""
         sizes = [self.quarters.back.camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
         if any(camera.image_size != size for camera, size in zip(alignment.cameras, sizes, strict=True)):
             alignment = cut_alignment(alignment, sizes)

@@ -57,7 +57,15 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
     candidates = first_pairs(features, options.seed, positions_of(sources))
     return_freed_memory()
     estimator = PairEstimator(
-        features, cameras, _matching(options), options.estimation, progress, executor, cache, store, aligner.exact_tilts
+        features,
+        cameras,
+        _matching(options),
+        options.estimation,
+        progress,
+        executor,
+        cache=cache,
+        store=store,
+        tilts=aligner.exact_tilts,
     )
     pairs = estimate_candidates(estimator, candidates)
     moving = without_static_background(estimator, pairs, candidates)
@@ -97,14 +105,14 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
 
 
 def _matching(options: StitchOptions) -> FeatureMatching:
-    """By the user's network, or by distances of descriptors."""
+    """Matching by the user's network, or by distances of descriptors."""
     network = options.lightglue_model
     matcher = partial(match, ratio=options.ratio) if network is None else LightGlue(network).match
     return FeatureMatching(matcher, options.ratio, network)
 
 
 def _low_contrast(equalized: Sequence[int], alignment: Alignment, paths: Sequence[str]) -> list[Message]:
-    """That local contrast was equalized, and in which of the images aligned, unless in all images."""
+    """A message on the aligned images whose local contrast was equalized."""
     everywhere = len(equalized) == len(paths)
     images = () if everywhere else tuple(paths[k] for k in equalized if alignment.used[k])
     if not (everywhere or images):

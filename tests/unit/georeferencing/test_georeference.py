@@ -31,7 +31,7 @@ from rdstitch.io import ImageSpec, write_strips
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.composition.map_canvas import canvas_on_map
-from rdstitch.pipeline.output_messages import place_messages
+from rdstitch.pipeline.composition.output_messages import place_messages
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.report import report_page
 from rdstitch.results.stitch_result import StitchResult

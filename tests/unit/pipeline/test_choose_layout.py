@@ -19,7 +19,7 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.composition.choose_layout import _alternatives, _differs, _error, _Trials, choose_layout
 from rdstitch.pipeline.composition.compose import CanvasLayout
 from rdstitch.pipeline.composition.lay_out import is_stretched
-from rdstitch.pipeline.output_messages import seam_messages
+from rdstitch.pipeline.composition.output_messages import seam_messages
 from rdstitch.pipeline.recipes import mosaic, pano
 from rdstitch.pipeline.registration.aligner import Aligner
 from rdstitch.pipeline.registration.realign import aligner_of, by_second_motions

@@ -1,9 +1,9 @@
-"""Which given image takes the place of which registered one: by name, what varies in the names, time, or position."""
+"""Assigning given images to registered ones: by name, by the varying part of names, by time, or by position."""
 
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
@@ -31,6 +31,15 @@ Chosen = list[Frame | None]
 """For each image of the registration the frame that takes its place."""
 
 
+@dataclass(frozen=True)
+class Counterparts:
+    """Which frames take the places of registered images."""
+
+    chosen: Chosen
+    matched: MatchedBy  # by what they were found
+    unused: Sequence[Message] = ()  # on frames that take no place
+
+
 class _Taken(NamedTuple):
     """When, s, and where an image was taken, as far as that is known."""
 
@@ -38,13 +47,11 @@ class _Taken(NamedTuple):
     position: GpsPosition | None = None
 
 
-def counterparts(
-    saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy
-) -> tuple[Chosen, MatchedBy, list[Message]]:
-    """For each registered image the frame that takes its place, by what it was found, and which frames have none."""
+def find_counterparts(saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy) -> Counterparts:
+    """Find the frame that takes the place of each registered image."""
     # Arrays have no names of their own.
     if match == "order" or all(frame.image is not None for frame in frames):
-        return list(_by_order(saved, frames)), "order", []
+        return Counterparts(list(_by_order(saved, frames)), "order")
     if match == "auto":  # read once, for whoever takes the frame
         frames = [_with_header(frame) for frame in frames]
     ways: tuple[tuple[MatchedBy, Callable[[], Chosen | None]], ...] = (
@@ -60,7 +67,7 @@ def counterparts(
         if any(frame is not None for frame in chosen):
             if matched == "name" and match == "auto":
                 _refuse_other_flights(saved, chosen)
-            return chosen, matched, _without_counterpart(of_all, frames)
+            return Counterparts(chosen, matched, _without_counterpart(of_all, frames))
     for path in files_of(frames):
         check_readable(path)
     wanted = next(image.name for image in saved.images if image.used)
@@ -99,7 +106,7 @@ def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[P
 
 
 def _refuse_other_flights(saved: SavedRegistration, chosen: Chosen) -> None:
-    """Refuse equal names of another flight, as cameras begin again at 1: times, or else places, tell them apart."""
+    """Refuse equal names of another flight, since cameras restart numbering, by times or else positions."""
     frames = [frame for frame in chosen if frame is not None]
     near = next(filter(None, (_by_measurement(saved, frames, by) for by in (_seconds, _metres))), chosen)
     for image, by_name, by_place in zip(saved.images, chosen, near, strict=True):
@@ -115,7 +122,7 @@ def _folders(frame: Frame) -> list[str]:
 
 
 def _by_varying_part(saved: SavedRegistration, frames: Sequence[Frame]) -> Chosen | None:
-    """By what differs between names of one side, as of V07_RED.jpg and V07_NIR.jpg."""
+    """Match by the part that varies among the names of each side, as in V07_RED.jpg and V07_NIR.jpg."""
     registered = _varying_parts([image.name for image in saved.images])
     given = _varying_parts([without_query(frame.path).name for frame in frames])
     if registered is None or given is None or not set(registered) & set(given):
@@ -125,7 +132,7 @@ def _by_varying_part(saved: SavedRegistration, frames: Sequence[Frame]) -> Chose
 
 
 def _varying_parts(names: Sequence[str]) -> list[tuple[str, ...]] | None:
-    """Of each name without suffix the parts that are not the same in all; None where these do not tell them apart."""
+    """The parts of each name that are not the same in all; None if they are not unique."""
     split = [_TOKEN.findall(Path(canonical_text(name)).stem) for name in names]
     if len(names) < 2 or len({len(parts) for parts in split}) != 1:
         return None
@@ -145,7 +152,7 @@ def _metres(taken: Sequence[_Taken]) -> FloatArray:
 def _by_measurement(
     saved: SavedRegistration, frames: Sequence[Frame], measure: Callable[[Sequence[_Taken]], FloatArray]
 ) -> Chosen | None:
-    """By what is nearer than half the way to the next registered image; None where most have no such counterpart."""
+    """Match frames within half the distance between registered images; None if most images have no such frame."""
     if any(frame.image is not None or frame.number is not None for frame in frames):
         return None
     count, used = len(saved.images), np.array([image.used for image in saved.images])
@@ -172,7 +179,7 @@ def _taken_frame(frame: Frame) -> _Taken:
 
 
 def _with_header(frame: Frame) -> Frame:
-    """The frame with what its file's header says; of one that cannot be read who reads its pixels will say so."""
+    """The frame with its header, if it can be read; reading the pixels reports it otherwise."""
     if frame.image is not None or frame.number is not None or frame.metadata is not None:
         return frame
     try:

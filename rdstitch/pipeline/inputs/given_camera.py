@@ -16,8 +16,14 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message
 
 
-def read_camera(file: str | Path, inputs: Sequence[Named] = ()) -> tuple[Camera, list[Message]]:
-    """The camera of a file, without a size that of ``inputs``, or bag; where λ is fitted to another model, how well."""
+def read_camera(camera: Camera | str | Path, inputs: Sequence[Named] = ()) -> tuple[Camera, list[Message]]:
+    """Read a camera from its file or a bag; with a message on the fit if λ is fitted to another lens model.
+
+    Its size, where a file has none, is that of the first of ``inputs``.
+    """
+    if isinstance(camera, Camera):
+        return camera, []
+    file = camera
     if is_bag(Path(file)):
         if (calibrated := camera_in_bag(Path(file))) is None:
             raise InputError(f"{file}: the bag has no calibration in a topic of camera_info")
@@ -48,8 +54,8 @@ def _stored_size(file: str | Path, inputs: Sequence[Named]) -> tuple[int, int]:
 def with_camera(
     options: StitchOptions, inputs: Sequence[Named] = (), *, of_bag: bool
 ) -> tuple[StitchOptions, list[Message]]:
-    """Options with the camera whose file they name; without any, if wanted, with that of a bag; what to know of it."""
-    if isinstance(options.camera, str | Path):
+    """The options with their camera file read or, ``of_bag``, the calibration of the input bag; with messages."""
+    if options.camera is not None:
         camera, messages = read_camera(options.camera, inputs)
         return replace(options, camera=camera), messages
     bag = only_bag(inputs) if of_bag and options.known_distortion is None else None
