@@ -1,7 +1,7 @@
 """Recomposing from a saved registration: other bands of the same flight, other sizes, other compositing options."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -115,23 +115,24 @@ def apply_to_images(saved: SavedRegistration, images: FoundImages, run: Run, opt
     given = read_replacements(saved, images.frames, options, run.guard, run.options.composite.max_memory)
     placed = saved.record.output.place is not None
     OutputFiles.of_images(run, ()).check_places(list(given.sources.values()), placed=placed)
-    lens, of_lens = _lens_of_band(saved, given.sources, run.progress)
-    layout, of_turn = _laid_out(saved, given.sources, lens, run.options.composite)
+    band = _compare_bands(saved, given.sources, run.progress)
+    layout, of_turn = _laid_out(saved, given.sources, band.lens, run.options.compositing)
     composed, of_output = compose_images(layout, run)
+    of_band = [] if band.note is None else [band.note]
     sources = dict(zip(given.sources, layout.placed.sources, strict=True))
     result = Recomposition(
         saved=saved,
         sources=tuple(map(sources.get, range(len(saved.images)))),
         matched=given.matched,
         left_out=given.left_out,
-        messages=(*given.messages, *of_lens, *of_turn, *images.messages, *run.guard.messages, *of_output),
+        messages=(*given.messages, *of_band, *of_turn, *images.messages, *run.guard.messages, *of_output),
         **composed.fields,
     )
     if options.dry_run or output is None:
         return result
     page = partial(plainly_viewed, result.canvas, [source.name for source in sources.values()])
     result = replace(result, messages=(*result.messages, *write_page(result, run.outputs, page)))
-    run.outputs.write(f"{output}.json", json_bytes(applied_sidecar(result, same_lens=lens is None)))
+    run.outputs.write(f"{output}.json", json_bytes(applied_sidecar(result, same_lens=band.lens is None)))
     return result
 
 
@@ -156,19 +157,25 @@ def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: Co
     return SavedGrid(matrix, size, place) if alike and matrix is not None and size is not None else None
 
 
-def _lens_of_band(
-    saved: SavedRegistration, used: Mapping[int, Source], progress: Progress
-) -> tuple[BandLens | None, list[Message]]:
+@dataclass(frozen=True)
+class _BandComparison:
+    """What the lens of the given images is, against that of the registered ones."""
+
+    lens: BandLens | None = None  # None: the same, as far as is known
+    note: Message | None = None
+
+
+def _compare_bands(saved: SavedRegistration, used: Mapping[int, Source], progress: Progress) -> _BandComparison:
     """Estimate the lens of the given images, if it is not the one that took the registered images."""
     if saved.record.stage is not None:
-        return None, []  # channels of a microscope have their places in common, not their content
+        return _BandComparison()  # channels of a microscope have their places in common, not their content
     frames = {index: source.frame or Frame(source.path) for index, source in used.items()}
     files = files_of(frame for frame in frames.values() if frame.number is None)
     originals = {k: file for k in frames if (file := saved.original(saved.images[k])) is not None}
     if files and not originals:
         name = saved.images[next(iter(frames))].path
         text = f"the registered images are not there any more ({name}, …): whether the same lens took the given ones, "
-        return None, [Message(f"{saved.path}: {text}from the same places, was not compared", severity="note")]
+        return _not_compared(saved, f"{text}from the same places, was not compared")
     elsewhere = {k: file for k, file in originals.items() if file.resolve() != frames[k].path.resolve()}
     pairs: dict[int, tuple[Source, Source]] = {}
     for index, file in elsewhere.items():
@@ -180,11 +187,15 @@ def _lens_of_band(
     lens = band_lens(pairs, lambda done, total: progress("comparing bands", done, total))
     if lens is None and pairs:
         text = "the given images show nothing that the registered ones do: whether the same lens took them is not known"
-        return None, [Message(f"{saved.path}: {text}", severity="note")]
+        return _not_compared(saved, text)
     if lens is None or lens.is_same:
-        return None, []
+        return _BandComparison()
     text = f"{lens.shift:.1f} pixels (median) from the registered band, {lens.error:.1f} with its lens registered too"
-    return lens, [Message(text, severity="note", code="band-lens")]
+    return _BandComparison(lens, Message(text, severity="note", code="band-lens"))
+
+
+def _not_compared(saved: SavedRegistration, text: str) -> _BandComparison:
+    return _BandComparison(note=Message(f"{saved.path}: {text}", severity="note"))
 
 
 def _placed(saved: SavedRegistration, used: Mapping[int, Source], lens: BandLens | None) -> PlacedImages:

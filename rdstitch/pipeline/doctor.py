@@ -7,12 +7,13 @@ from typing import Any, Self
 
 import numpy as np
 
-from rdstitch.alignment.overlap import median_overlap
+from rdstitch.alignment import Alignment
 from rdstitch.choices import ChannelOrder
 from rdstitch.compositing import CompositePlan
 from rdstitch.errors import InputError, LimitError, RegistrationError
 from rdstitch.features import FeatureOptions
 from rdstitch.features.image_quality import ImageQuality
+from rdstitch.geometry.camera import points_over
 from rdstitch.inputs.find import found_images
 from rdstitch.inputs.frame import Frame, Images, as_inputs
 from rdstitch.inputs.source import Source, read_sources
@@ -31,6 +32,7 @@ from rdstitch.verification.verdict import RefusedError
 _MEGAPIXELS, _FEATURES = 0.2, 500  # of the small versions
 _BLURRED = 0.6  # of the median sharpness
 _DARK, _BURNT = 0.06, 0.05  # mean brightness; share of burnt-out pixels
+_GRID = 24  # points a side by which an overlap is measured
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ def examine(
     if (registration := tried.registration) is not None:
         alignment = registration.alignment
         placed = zip(registration.sources, alignment.used, strict=True)
-        alone, overlap = tuple(source.name for source, is_used in placed if not is_used), median_overlap(alignment)
+        alone, overlap = tuple(source.name for source, is_used in placed if not is_used), _median_overlap(alignment)
     return Examination(
         images=len(sources),
         unreadable=tuple(unreadable),
@@ -170,6 +172,19 @@ def _dry_run(frames: Sequence[Frame], progress: Progress) -> _DryRun:
         return _DryRun.of(refused.registration)
     except (RegistrationError, LimitError) as error:
         return _DryRun(problems=(Message(str(error)),))
+
+
+def _median_overlap(alignment: Alignment) -> float | None:
+    """Median over the images of the largest share that another one shows too; None where none overlap."""
+    best = np.zeros(len(alignment.used))
+    for fit in (fit for fit in alignment.links if fit.used):
+        for first, second in (fit.images, fit.images[::-1]):
+            size, other = alignment.cameras[first].image_size, alignment.cameras[second].image_size
+            with np.errstate(invalid="ignore"):
+                moved = alignment.transfer(first, second, points_over(size, _GRID))
+                inside = ((moved >= -0.5) & (moved < np.array(other) - 0.5)).all(axis=1)
+            best[first] = max(best[first], inside.mean())
+    return float(np.median(best[best > 0])) if (best > 0).any() else None
 
 
 def _camera_name(source: Source) -> str:

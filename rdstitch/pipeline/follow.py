@@ -31,7 +31,7 @@ from rdstitch.inputs.times import time_of, timestamps_of
 from rdstitch.io.opening import check_readable
 from rdstitch.options.option import options_of
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.inputs.given_camera import with_camera
+from rdstitch.pipeline.inputs.camera_and_odometry import with_camera
 from rdstitch.pipeline.inputs.read_inputs import read_frames
 from rdstitch.pipeline.registration.alignment_inputs import alignment_options
 from rdstitch.pipeline.registration.working_size import at_working_size

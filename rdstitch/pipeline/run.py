@@ -20,8 +20,7 @@ from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.option import check_parameter, options_of
 from rdstitch.options.shared_options import Every
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.camera_path import with_odometry_of_bag
-from rdstitch.pipeline.inputs.given_camera import with_camera
+from rdstitch.pipeline.inputs.camera_and_odometry import with_camera, with_odometry_of_bag
 from rdstitch.results.messages import Message
 from rdstitch.system.outputs import Outputs
 from rdstitch.system.progress import Progress, StageTimer, silent

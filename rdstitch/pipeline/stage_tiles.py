@@ -92,7 +92,7 @@ def tiles(
         files = _checked_files(images, run, options, positions_file)
         _, registration = _register(images, run, options, files, positions_file)
         with run.executor(len(registration.sources)) as executor:
-            chosen = lay_out(registration, no_local_alignment("tiles on a stage"), options.composite)
+            chosen = lay_out(registration, no_local_alignment("tiles on a stage"), run.options.compositing)
             return compose_registration(chosen, run, files, executor)
 
 

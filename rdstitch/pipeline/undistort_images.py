@@ -21,7 +21,7 @@ from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.write import write_image
 from rdstitch.options.option import options_of, with_fields
 from rdstitch.options.undistort_options import UndistortOptions
-from rdstitch.pipeline.inputs.given_camera import read_camera
+from rdstitch.pipeline.inputs.camera_and_odometry import read_camera
 from rdstitch.results.messages import Message, ignored
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.output_checks import WRITABLE_SUFFIXES, check_outputs

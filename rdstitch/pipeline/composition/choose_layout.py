@@ -71,11 +71,11 @@ class _Trials:
         whole = replace(whole, alignment=on_whole_pixels(whole.alignment, whole.pairs))
         if local is None:
             local = align_registration_locally(whole, options.local_alignment, self.edges_of, options.threads)
-        return lay_out(whole, local, options.composite)
+        return lay_out(whole, local, options.compositing)
 
     def judge(self, registration: Registration, local: LocalAlignment | None = None) -> CandidateLayout:
         """The same, with exposure and seams."""
-        return self.lay_out(registration, local).judged(self.options.compositing)
+        return self.lay_out(registration, local).judged()
 
     def attempt(self, registration: Registration) -> CandidateLayout | None:
         """Lay out an alternative registration; None where it has no canvas, or none that the options can turn."""

@@ -52,6 +52,7 @@ class CanvasLayout:
     canvas: Canvas
     images: Sequence[PlacedImage]
     placement: MapPlacement
+    options: CompositeOptions
 
     @classmethod
     def of(cls, placed: PlacedImages, options: CompositeOptions) -> Self:
@@ -59,11 +60,15 @@ class CanvasLayout:
         canvas, placement = canvas_on_map(placed, options)
         if options.rectangle is not None:
             canvas = replace(canvas, cropped_to=_box_of_rectangle(placed, options.rectangle, canvas))
-        return cls(placed, canvas, placed.images(canvas), placement)
+        return cls(placed, canvas, placed.images(canvas), placement, options)
 
-    def decide(self, options: CompositeOptions) -> Decisions:
+    def decide(self) -> Decisions:
         """Decide on exposure, seams and crop of the images, on small versions of them."""
-        return decide(self.images, self.canvas, options)
+        return decide(self.images, self.canvas, self.options)
+
+    def decided(self) -> "DecidedLayout":
+        """The same with what was decided, which is not decided again."""
+        return DecidedLayout(self.placed, self.canvas, self.images, self.placement, self.options, self.decide())
 
     def place_of(self, final: Canvas) -> Georeference | None:
         """The place of the final canvas on the Earth."""
@@ -74,11 +79,11 @@ class CanvasLayout:
 
 @dataclass(frozen=True)
 class DecidedLayout(CanvasLayout):
-    """Images on the canvas of the output, for which exposure, seams and crop were decided by the options."""
+    """Images on the canvas of the output, for which exposure, seams and crop were decided."""
 
     decisions: Decisions
 
-    def decide(self, options: CompositeOptions) -> Decisions:
+    def decide(self) -> Decisions:
         """What was decided."""
         return self.decisions
 
@@ -92,7 +97,7 @@ def compose_images(
     :func:`rdstitch.compositing.compose_decided`.
     """
     return_freed_memory()
-    options, output = run.options.compositing, run.output
+    options, output = layout.options, run.output
     placed, canvas, placement = layout.placed, layout.canvas, layout.placement
     messages = masked_messages(placed) + place_messages(placement, placed) + cut_away_messages(placed, canvas, options)
     # A crop may yet make it fit.
@@ -109,7 +114,7 @@ def compose_images(
     )
     if run.options.dry_run:
         return replace(laid_out, plan=planned(layout.images, canvas, options)), messages
-    decisions = layout.decide(options)
+    decisions = layout.decide()
     if not placed.tiles:  # seams are judged as seen in a photograph
         messages += seam_messages(decisions.quality, [str(source.path) for source in placed.sources])
     composed, of_output = _drawn(replace(laid_out, seams=decisions.quality), layout, decisions, run, run_blocks)
@@ -133,7 +138,7 @@ def _drawn(
         image = compose_decided(decisions, report, run_blocks)
         place = layout.place_of(image.canvas)
         return replace(laid_out, composite=image, canvas=image.canvas, georeference=place), [*image.messages]
-    metadata = _metadata(sources[0], run.options.compositing)
+    metadata = _metadata(sources[0], layout.options)
     written = compose_to_file(
         output, decisions, report, run_blocks, metadata=metadata, extra_tags=tags, outputs=outputs
     )

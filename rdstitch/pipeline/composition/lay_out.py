@@ -36,11 +36,9 @@ class RegistrationLayout:
     layout: CanvasLayout
     messages: tuple[Message, ...] = ()
 
-    def judged(self, options: CompositeOptions) -> "CandidateLayout":
+    def judged(self) -> "CandidateLayout":
         """The same with seams, by which layouts are compared."""
-        layout, decisions = self.layout, self.layout.decide(options)
-        decided = DecidedLayout(layout.placed, layout.canvas, layout.images, layout.placement, decisions)
-        return CandidateLayout(self.registration, self.local, decided, self.messages)
+        return CandidateLayout(self.registration, self.local, self.layout.decided(), self.messages)
 
 
 @dataclass(frozen=True)

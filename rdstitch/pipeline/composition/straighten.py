@@ -1,7 +1,7 @@
 """Straightening and view rotation of registered images, before their canvas is planned."""
 
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
@@ -25,12 +25,28 @@ _DETECTION = 0.3  # pixels: how well the detector does
 _SURE = 0.01  # relative standard deviation of an aspect ratio that needs no warning
 
 
+@dataclass(frozen=True, eq=False)
+class _Straightening:
+    """How the scene becomes upright."""
+
+    upright: Upright | None = None  # None: nothing shows how
+    message: Message | None = None
+
+    def matrix(self, reference: ReferenceView) -> FloatArray | None:
+        """What (3, 3) makes it upright."""
+        return None if self.upright is None else self.upright.matrix(reference.frame, turned=reference.turned)
+
+
 def oriented(placed: PlacedImages, options: CompositeOptions) -> tuple[PlacedImages, list[Message]]:
     """Turn the images as the options say; with messages.
 
     :attr:`PlacedImages.orientation` is the rotation applied.
     """
-    upright, messages = _upright(placed, options) if options.upright else (None, [])
+    upright, messages = None, list[Message]()
+    if options.upright:
+        reference = _reference_view(placed)
+        found = _straightening(reference, placed, options)
+        upright, messages = found.matrix(reference), [] if found.message is None else [found.message]
     if upright is not None and options.straighten == "auto":
         before, after = (_cut_away(placed, options, turn) for turn in (np.eye(3), upright))
         if after > before + Limits.max_straightening_cut:
@@ -71,44 +87,43 @@ def _cut_away(placed: PlacedImages, options: CompositeOptions, matrix: FloatArra
     return 1.0
 
 
-def _upright(placed: PlacedImages, options: CompositeOptions) -> tuple[FloatArray | None, list[Message]]:
-    """The matrix (3, 3) that makes the scene upright; None if nothing shows how."""
+def _reference_view(placed: PlacedImages) -> ReferenceView:
     if placed.reference is None:
         raise ArgumentError("the reference image is not among the images: nothing can be turned upright")
     camera, frame = placed.cameras[placed.reference], placed.homographies[placed.reference]
-    reference = ReferenceView.of(camera, frame, turned=placed.turned)
-    upright: Upright | None
+    return ReferenceView.of(camera, frame, turned=placed.turned)
+
+
+def _straightening(reference: ReferenceView, placed: PlacedImages, options: CompositeOptions) -> _Straightening:
     if options.rectangle is not None:
-        upright, message = _by_rectangle(reference, np.reshape(options.rectangle, (4, 2)))
-    elif options.straighten == "auto":
-        upright, message = _by_edges(reference, placed)
-    elif options.straighten != "off":
-        upright = reference.upright_by_lines(np.reshape(options.straighten, (-1, 2)), _POINTING)
-        message = None
-    else:
-        upright, message = _by_gravity(reference, placed)
-    messages = [] if message is None else [message]
-    return None if upright is None else upright.matrix(reference.frame, turned=placed.turned), messages
+        return _by_rectangle(reference, np.reshape(options.rectangle, (4, 2)))
+    if options.straighten == "auto":
+        return _by_edges(reference, placed)
+    if options.straighten != "off":
+        return _Straightening(reference.upright_by_lines(np.reshape(options.straighten, (-1, 2)), _POINTING))
+    return _by_gravity(reference, placed)
 
 
-def _by_rectangle(reference: ReferenceView, corners: FloatArray) -> tuple[Upright, Message | None]:
+def _by_rectangle(reference: ReferenceView, corners: FloatArray) -> _Straightening:
     """By the corners (4, 2) of what is a rectangle in the scene, pixels of the reference image."""
     camera = reference.camera
     pixel = 1.0 / camera.scale
     upright, aspect, error = of_rectangle(reference.undistorted(corners), reference.focal, pixel)
     text = f"rectangle: {aspect:.4g} times as wide as high ± {error:.1%}"
     text += f", with a focal length of {upright.focal.value / pixel:.0f} pixels ({camera.focal_source or 'guess'})"
-    return upright, Message(text, severity="warning" if error > _SURE else "note")
+    return _Straightening(upright, Message(text, severity="warning" if error > _SURE else "note"))
 
 
-def _by_edges(reference: ReferenceView, placed: PlacedImages) -> tuple[Upright | None, Message | None]:
+def _by_edges(reference: ReferenceView, placed: PlacedImages) -> _Straightening:
     """By what seem to be horizontal and vertical edges of the scene."""
     edges = _detected_edges(reference, placed)
     axes = of_scene(edges, reference.start, reference.focal, depth=reference.turned)
     if axes is None:
-        return None, Message("no straight edges were found: the output is not turned", code="not-straightened")
+        text = "no straight edges were found: the output is not turned"
+        return _Straightening(message=Message(text, code="not-straightened"))
     upright, across, down = axes
-    return upright, Message(f"straightened by {across} horizontal and {down} vertical edges", severity="note")
+    text = f"straightened by {across} horizontal and {down} vertical edges"
+    return _Straightening(upright, Message(text, severity="note"))
 
 
 def _detected_edges(reference: ReferenceView, placed: PlacedImages) -> Edges:
@@ -124,11 +139,10 @@ def _detected_edges(reference: ReferenceView, placed: PlacedImages) -> Edges:
     return reference.edges(np.concatenate(segments), error)
 
 
-def _by_gravity(reference: ReferenceView, placed: PlacedImages) -> tuple[Upright | None, Message | None]:
+def _by_gravity(reference: ReferenceView, placed: PlacedImages) -> _Straightening:
     """By what was measured to be down, or is down in most images."""
     if reference.turned:
-        return None, Message("the horizon of a panorama is level already", severity="note")
+        return _Straightening(message=Message("the horizon of a panorama is level already", severity="note"))
     upright = reference.upright_by_gravity(placed.homographies, [source.down for source in placed.sources])
-    if upright is None:
-        return None, Message("the camera looks straight down: there is nothing to level")
-    return upright, None
+    level = Message("the camera looks straight down: there is nothing to level") if upright is None else None
+    return _Straightening(upright, level)

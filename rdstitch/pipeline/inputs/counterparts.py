@@ -4,6 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
@@ -54,15 +55,8 @@ def find_counterparts(saved: SavedRegistration, frames: Sequence[Frame], match: 
         return Counterparts(list(_by_order(saved, frames)), "order")
     if match == "auto":  # read once, for whoever takes the frame
         frames = [_with_header(frame) for frame in frames]
-    ways: tuple[tuple[MatchedBy, Callable[[], Chosen | None]], ...] = (
-        ("name", lambda: _by_name(saved, frames, attrgetter("name"))),
-        ("name", lambda: _by_name(saved, frames, attrgetter("stem"))),
-        ("name", lambda: _by_varying_part(saved, frames)),
-        ("time", lambda: _by_measurement(saved, frames, _seconds)),
-        ("position", lambda: _by_measurement(saved, frames, _metres)),
-    )
-    for matched, find in ways[:3] if match == "name" else ways:
-        of_all = find() or [None] * len(saved.images)
+    for matched, find in _BY_NAMES if match == "name" else (*_BY_NAMES, *_BY_HEADERS):
+        of_all = find(saved, frames) or [None] * len(saved.images)
         chosen = [frame if image.used else None for image, frame in zip(saved.images, of_all, strict=True)]
         if any(frame is not None for frame in chosen):
             if matched == "name" and match == "auto":
@@ -201,3 +195,15 @@ def _by_order(saved: SavedRegistration, frames: Sequence[Frame]) -> Sequence[Fra
             "the same names, or equally many"
         )
     return frames
+
+
+_Way = tuple[MatchedBy, Callable[[SavedRegistration, Sequence[Frame]], Chosen | None]]
+_BY_NAMES: tuple[_Way, ...] = (
+    ("name", partial(_by_name, key=attrgetter("name"))),
+    ("name", partial(_by_name, key=attrgetter("stem"))),
+    ("name", _by_varying_part),
+)
+_BY_HEADERS: tuple[_Way, ...] = (
+    ("time", partial(_by_measurement, measure=_seconds)),
+    ("position", partial(_by_measurement, measure=_metres)),
+)

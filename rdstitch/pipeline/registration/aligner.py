@@ -50,6 +50,15 @@ def impossible_estimates_fail() -> Iterator[None]:
 
 
 @dataclass(frozen=True)
+class TaskOfPairs:
+    """An alignment task, with the pairs that its evidence was chosen from."""
+
+    pairs: Sequence[PairRegistration]
+    distinct: DistinctPairs
+    task: AlignmentTask
+
+
+@dataclass(frozen=True)
 class AlignedPairs:
     """Pairs, and the alignment that was made from them."""
 
@@ -62,17 +71,8 @@ class AlignedPairs:
 class DraftedPairs(AlignedPairs):
     """Pairs, and a draft of their alignment, by a few matches of each."""
 
-    task: "_DistinctTask"  # what it is a draft of
+    task: TaskOfPairs  # what it is a draft of
     known: KnownModel | None  # what a draft by more pairs can start from
-
-
-@dataclass(frozen=True)
-class _DistinctTask:
-    """An alignment task, with the pairs that its evidence was chosen from."""
-
-    pairs: Sequence[PairRegistration]
-    distinct: DistinctPairs
-    task: AlignmentTask
 
 
 @dataclass(frozen=True)
@@ -158,22 +158,22 @@ class Aligner:
             raise RegistrationError(_no_overlap(self.paths, pairs))
         distinct = DistinctPairs.of(pairs, self.options, self.quarters, counted)
         task = replace(self._task(distinct), known=known)
-        of_distinct = _DistinctTask(pairs, distinct, task)
+        of_pairs = TaskOfPairs(pairs, distinct, task)
         drafted, draft_model = self._recalled("draft", task, lambda: (task.draft, task.draft_model))
-        draft = self._of_all_images(drafted, of_distinct)
+        draft = self._of_all_images(drafted, of_pairs)
         if misfits := distinct.misfits(draft):
             with_them = self._drafted(pairs, counted=counted | misfits)
             if with_them.alignment.model != draft.model:  # so little new ground tells of motion, but not of the lens
                 return with_them
-        return DraftedPairs(tuple(pairs), draft, rough=False, task=of_distinct, known=draft_model)
+        return DraftedPairs(tuple(pairs), draft, rough=False, task=of_pairs, known=draft_model)
 
-    def _of_all_images(self, alignment: Alignment, of_distinct: _DistinctTask) -> Alignment:
+    def _of_all_images(self, alignment: Alignment, of_pairs: TaskOfPairs) -> Alignment:
         """The alignment of a task as that of all upright images, copies included."""
-        distinct = of_distinct.distinct
-        alignment = self._upright(alignment, of_distinct.task)
+        distinct = of_pairs.distinct
+        alignment = self._upright(alignment, of_pairs.task)
         compared = [distinct.registered[ends].images for ends in distinct.evidence]
         alignment = alignment.with_copies(distinct.copies, compared)
-        others = links_of_copies(alignment, of_distinct.pairs, self.threshold)
+        others = links_of_copies(alignment, of_pairs.pairs, self.threshold)
         alignment = replace(alignment, links=(*alignment.links, *others))
         twice = sorted({*distinct.copies, *distinct.near_copies})
         if not twice:

@@ -1,6 +1,7 @@
 """How much straightening may cut away."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,8 @@ def test_no_straightening_that_cuts_most_away(projection: Any, done: bool, monke
     directions = np.swapaxes(looks, 1, 2) @ np.diag([1.0, 1.0, 260.0 / lens.scale])
     placed = PlacedImages([replace(source(f"{k}.jpg"), camera=lens) for k in range(3)], directions, 1, turned=True)
     upwards = view_rotation(CompositeOptions(pitch=-50.0))
-    monkeypatch.setattr(straighten, "_upright", lambda placed, options: (upwards, []))
+    upright: Any = SimpleNamespace(matrix=lambda *_, **__: upwards)
+    monkeypatch.setattr(straighten, "_straightening", lambda *_: straighten._Straightening(upright))
     options = CompositeOptions(straighten="auto", projection=projection)
     found, said = straighten.oriented(placed, options)
     assert (found.orientation is not None) == done

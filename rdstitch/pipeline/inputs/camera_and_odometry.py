@@ -1,6 +1,6 @@
-"""The camera that the user gives, in a file or in a ROS bag."""
+"""The camera and the odometry that the user gives, in files or in a ROS bag."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,8 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import inverse, turned_size
 from rdstitch.inputs.find import find_images
 from rdstitch.inputs.frame import Named
-from rdstitch.inputs.rosbag import camera_in_bag, is_bag, only_bag
+from rdstitch.inputs.odometry import Odometry
+from rdstitch.inputs.rosbag import camera_in_bag, is_bag, odometry_in_bag, only_bag
 from rdstitch.io.metadata import read_metadata
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message
@@ -65,3 +66,13 @@ def with_camera(
     text = f"the calibration in the bag, {topic}, is used; --camera FILE takes another one"
     note = Message(text, (str(bag),), "note")
     return replace(options, camera=file.camera, lens="auto", solver="auto"), [note]
+
+
+def with_odometry_of_bag(inputs: Iterable[Named], options: StitchOptions) -> StitchOptions:
+    """The options, with odometry read from the input bag if they name one of its topics."""
+    topic = options.odometry
+    if topic is None or isinstance(topic, Odometry) or Path(topic).is_file() or not str(topic).startswith("/"):
+        return options
+    if (bag := only_bag(inputs)) is None:
+        raise InputError(f"{topic}: no such file; a topic of odometry needs one ROS bag as input")
+    return replace(options, odometry=odometry_in_bag(bag, str(topic)))
