@@ -67,8 +67,8 @@ def follow(
             continue
         frame = arrived if arrived.number is not None else replace(arrived, number=number)
         read = tracker.read(frame)
-        source = read.source
-        if (read.image is None or (source is not None and source.guard.messages)) and comes_again(arrived):
+        source, is_whole = read.source, isinstance(read, ReadFrame) and not read.source.guard.messages
+        if not is_whole and comes_again(arrived):
             unread[arrived.path] = number
             continue
         poses_of_frame = tracker.register(read)
@@ -89,9 +89,16 @@ class ReadFrame(NamedTuple):
     """A frame that arrived, as it is tracked."""
 
     frame: Frame
-    source: Source | None = None
-    image: PreparedImage | None = None
-    problem: str = ""  # why there is no image
+    source: Source
+    image: PreparedImage
+
+
+class UnreadFrame(NamedTuple):
+    """A frame that arrived, but cannot be tracked."""
+
+    frame: Frame
+    problem: str
+    source: Source | None = None  # where its header was read
 
 
 class Tracker:
@@ -191,14 +198,14 @@ class Tracker:
         self.revised = tuple(revised)
         return pose
 
-    def read(self, frame: Frame, attitude: Sequence[float] | None = None) -> ReadFrame:
+    def read(self, frame: Frame, attitude: Sequence[float] | None = None) -> ReadFrame | UnreadFrame:
         """Read and prepare a frame for tracking."""
         options, features = self._options, self._detection
         if options.timestamps is not None and (time := time_of(frame, options.timestamps)) is not None:
             frame = replace(frame, timestamp=time)
         sources, unread = read_frames([frame], options, InputGuard(options.strict), skip_bad=True)
         if not sources:
-            return ReadFrame(frame, problem=unread[0].text)
+            return UnreadFrame(frame, unread[0].text)
         source, megapixels = sources[0], self._megapixels
         try:
             if attitude is not None:
@@ -208,7 +215,7 @@ class Tracker:
             image = prepare(view, megapixels, stretch=features.stretch, equalize=bool(features.equalize))
             return ReadFrame(frame, source, image)
         except InputError as error:
-            return ReadFrame(frame, source, problem=str(error))
+            return UnreadFrame(frame, str(error), source)
 
     def _with_measurements(self, source: Source) -> list[Source]:
         """The frame with its mask and attitude."""
@@ -216,18 +223,18 @@ class Tracker:
         (source,) = with_masks([source], options.mask, all_known=False)
         return [source] if source.attitude is not None else with_attitudes([source], options.attitude)
 
-    def register(self, read: ReadFrame, body: BodyPose | None = None) -> list[Pose]:
+    def register(self, read: ReadFrame | UnreadFrame, body: BodyPose | None = None) -> list[Pose]:
         """Register a frame that was read; its pose comes last, after those of earlier frames that changed."""
-        source, image = read.source, read.image
-        label = Pose(read.frame.name, read.frame.number or 0, math.nan, TrackingResult(), read.problem, self._poses)
-        if source is None or image is None:
-            return [label]
-        label = replace(label, name=source.name, timestamp=float(timestamps_of([source])[0]))
+        number = read.frame.number or 0
+        if isinstance(read, UnreadFrame):
+            return [Pose(read.frame.name, number, math.nan, problem=read.problem, poses=self._poses)]
+        source = read.source
+        label = Pose(source.name, number, float(timestamps_of([source])[0]), poses=self._poses)
         camera = at_working_size(source.camera, self._megapixels)
         attitude = None if source.attitude is None else source.attitude.at_delays
         if body is None and (odometry := as_odometry(self._options.odometry)) is not None:
             body = odometry.at(label.timestamp)
-        results = self._frames.add(image, camera, attitude, body)
+        results = self._frames.add(read.image, camera, attitude, body)
         self._labels[results[-1].number] = label
         return self._poses_of(results)
 
