@@ -73,7 +73,7 @@ def _pair(
     fitted, links = tiled.adjustment, tiled.links
     first, second = links.tiles[number].tolist()
     of_pair = np.flatnonzero(links.pair == number)
-    agreeing = fitted.squared[of_pair] / fitted.noise < 16.0
+    agreeing = fitted.agreeing[of_pair]
     errors, used = np.linalg.norm(fitted.residuals[of_pair], axis=1), bool(fitted.holding[number])
     rms = math.sqrt(float((errors[agreeing] ** 2).mean())) if agreeing.any() else math.nan
     matrix = np.linalg.solve(homographies[second], homographies[first])

@@ -62,6 +62,11 @@ class Adjustment:
         """Which pairs hold their tiles where they are (P,); the others contradict them."""
         return self.weights > _HOLDING_WEIGHT
 
+    @property
+    def agreeing(self) -> BoolArray:
+        """Which blocks are where the places put them, as far as their noise goes (M,)."""
+        return self.squared / self.noise < _WIDTH**2
+
     def between(self, pair: IntArray) -> tuple[FloatArray, FloatArray]:
         """Place of the second tile of a pair in the first (2,), and its covariance (2, 2)."""
         first, second = pair.tolist()

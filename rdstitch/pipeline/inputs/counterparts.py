@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +20,6 @@ from rdstitch.io.metadata import read_metadata
 from rdstitch.io.opening import check_readable
 from rdstitch.numerics.nearest_points import nearest_points
 from rdstitch.results.messages import Message, names_of, shortened
-from rdstitch.sidecar.image_record import ImageRecord
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.records import MatchedBy
 from rdstitch.system.file_access import canonical_name, canonical_text, without_query
@@ -39,13 +37,6 @@ class Counterparts:
     chosen: Chosen
     matched: MatchedBy  # by what they were found
     unused: Sequence[Message] = ()  # on frames that take no place
-
-
-class _Taken(NamedTuple):
-    """When, s, and where an image was taken, as far as that is known."""
-
-    time: float | None = None
-    position: GpsPosition | None = None
 
 
 def find_counterparts(saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy) -> Counterparts:
@@ -102,7 +93,7 @@ def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[P
 def _refuse_other_flights(saved: SavedRegistration, chosen: Chosen) -> None:
     """Refuse equal names of another flight, since cameras restart numbering, by times or else positions."""
     frames = [frame for frame in chosen if frame is not None]
-    near = next(filter(None, (_by_measurement(saved, frames, by) for by in (_seconds, _metres))), chosen)
+    near = next(filter(None, (_by_measurement(saved, frames, by) for by in (_times, _places))), chosen)
     for image, by_name, by_place in zip(saved.images, chosen, near, strict=True):
         if by_name is not None and by_place is not None and by_name is not by_place:
             raise InputError(
@@ -135,22 +126,30 @@ def _varying_parts(names: Sequence[str]) -> list[tuple[str, ...]] | None:
     return keys if max(Counter(keys).values()) == 1 else None
 
 
-def _seconds(taken: Sequence[_Taken]) -> FloatArray:
-    return np.array([[np.nan if one.time is None else one.time] for one in taken])
+def _times(saved: SavedRegistration, frames: Sequence[Frame]) -> FloatArray:
+    """Seconds (N + M, 1) at which registered images and frames were taken; NaN where unknown."""
+    of_frames = [None if frame.metadata is None else frame.metadata.timestamp for frame in frames]
+    times = [*(image.timestamp for image in saved.images), *of_frames]
+    return np.array([[np.nan if time is None else time] for time in times])
 
 
-def _metres(taken: Sequence[_Taken]) -> FloatArray:
-    return metres_around_median([one.position for one in taken])
+def _places(saved: SavedRegistration, frames: Sequence[Frame]) -> FloatArray:
+    """Metres (N + M, 2) east and north where registered images and frames were taken; NaN where unknown."""
+    of_images = [None if image.gps is None else GpsPosition(*image.gps) for image in saved.images]
+    of_frames = [None if frame.metadata is None else frame.metadata.gps for frame in frames]
+    return metres_around_median([*of_images, *of_frames])
 
 
 def _by_measurement(
-    saved: SavedRegistration, frames: Sequence[Frame], measure: Callable[[Sequence[_Taken]], FloatArray]
+    saved: SavedRegistration,
+    frames: Sequence[Frame],
+    measure: Callable[[SavedRegistration, Sequence[Frame]], FloatArray],
 ) -> Chosen | None:
     """Match frames within half the distance between registered images; None if most images have no such frame."""
     if any(frame.image is not None or frame.number is not None for frame in frames):
         return None
     count, used = len(saved.images), np.array([image.used for image in saved.images])
-    measured = measure([*map(_taken_image, saved.images), *map(_taken_frame, frames)])
+    measured = measure(saved, frames)
     registered, given = np.where(used[:, None], measured[:count], np.nan), measured[count:]
     known, known_given = (np.flatnonzero(np.isfinite(rows).all(axis=1)) for rows in (registered, given))
     if len(known) < 2 or not len(known_given):
@@ -162,14 +161,6 @@ def _by_measurement(
     counts = Counter(nearest.values())
     chosen = [frames[nearest[k]] if k in nearest and counts[nearest[k]] == 1 else None for k in range(count)]
     return chosen if 2 * sum(frame is not None for frame in chosen) > used.sum() else None
-
-
-def _taken_image(image: ImageRecord) -> _Taken:
-    return _Taken(image.timestamp, None if image.gps is None else GpsPosition(*image.gps))
-
-
-def _taken_frame(frame: Frame) -> _Taken:
-    return _Taken() if frame.metadata is None else _Taken(frame.metadata.timestamp, frame.metadata.gps)
 
 
 def _with_header(frame: Frame) -> Frame:
@@ -204,6 +195,6 @@ _BY_NAMES: tuple[_Way, ...] = (
     ("name", _by_varying_part),
 )
 _BY_HEADERS: tuple[_Way, ...] = (
-    ("time", partial(_by_measurement, measure=_seconds)),
-    ("position", partial(_by_measurement, measure=_metres)),
+    ("time", partial(_by_measurement, measure=_times)),
+    ("position", partial(_by_measurement, measure=_places)),
 )
