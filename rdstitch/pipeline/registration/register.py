@@ -56,16 +56,9 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
     candidates = first_pairs(features, options.seed, positions_of(sources))
     return_freed_memory()
+    matching, known, tilts = _matching(options), options.estimation, aligner.exact_tilts
     estimator = PairEstimator(
-        features,
-        cameras,
-        _matching(options),
-        options.estimation,
-        progress,
-        executor,
-        cache=cache,
-        store=store,
-        tilts=aligner.exact_tilts,
+        features, cameras, matching, known, progress, executor, cache=cache, store=store, tilts=tilts
     )
     pairs = estimate_candidates(estimator, candidates)
     moving = without_static_background(estimator, pairs, candidates)
