@@ -157,7 +157,7 @@ class Aligner:
         if not any(pair.relation for pair in pairs):
             raise RegistrationError(_no_overlap(self.paths, pairs))
         distinct = DistinctPairs.of(pairs, self.options, self.quarters, counted)
-        task = replace(self._task(distinct), known=known)
+        task = self._task(distinct, known)
         of_pairs = TaskOfPairs(pairs, distinct, task)
         drafted, draft_model = self._recalled("draft", task, lambda: (task.draft, task.draft_model))
         draft = self._of_all_images(drafted, of_pairs)
@@ -182,7 +182,7 @@ class Aligner:
         text = f"counted once, because they show almost only what other images show: {names}"
         return alignment.with_messages([Message(text, severity="detail", code="copies")])
 
-    def _task(self, distinct: DistinctPairs) -> AlignmentTask:
+    def _task(self, distinct: DistinctPairs, known: KnownModel | None) -> AlignmentTask:
         """The task of aligning images as they are stored; images cut to several sizes in a common frame."""
         stored, count = self.quarters.back, len(distinct.evidence)
         cameras = tuple(stored.camera(camera, k) for k, camera in enumerate(self.cameras))
@@ -195,7 +195,7 @@ class Aligner:
         if (size := common_size(cameras, links)) is not None:
             cameras = tuple(framed_camera(camera, size) for camera in cameras)
             links = tuple(framed_link(link, size) for link in links)
-        return AlignmentTask(cameras, links[:count], distinct.options, distinct.near_copies, links[count:])
+        return AlignmentTask(cameras, links[:count], distinct.options, distinct.near_copies, links[count:], known)
 
     def _recalled(self, stage: str, task: AlignmentTask, compute: Callable[[], Computed]) -> Computed:
         """A result of a task, from the cache if it is there."""
