@@ -22,6 +22,7 @@ _NAMES = {
     "options.files_beside": "FilesBeside",
     "options.stitch_options": "StitchOptions",
     "options.tile_options": "TileOptions",
+    "options.undistort_options": "UndistortOptions",
     "pipeline.apply_sidecar": "apply",
     "pipeline.blocks": "mosaic_blocks",
     "pipeline.composer": "Composer",

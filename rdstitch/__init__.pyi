@@ -14,6 +14,7 @@ from rdstitch.options.feature_options import FeatureOptions as FeatureOptions
 from rdstitch.options.files_beside import FilesBeside as FilesBeside
 from rdstitch.options.stitch_options import StitchOptions as StitchOptions
 from rdstitch.options.tile_options import TileOptions as TileOptions
+from rdstitch.options.undistort_options import UndistortOptions as UndistortOptions
 from rdstitch.pipeline.apply_sidecar import apply as apply
 from rdstitch.pipeline.blocks import mosaic_blocks as mosaic_blocks
 from rdstitch.pipeline.composer import Composer as Composer

@@ -2,8 +2,8 @@
 
 import json
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Iterable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,9 +14,8 @@ from rdstitch_cli.stitching import warn_of
 from rdstitch_cli.terminal import Reporter
 
 if TYPE_CHECKING:
-    from rdstitch.inputs.frame import Named
-    from rdstitch.pipeline.output_plan import OutputPlan
-    from rdstitch.results.pose import FollowedPoses, Pose
+    from rdstitch.pipeline.live_source import FollowedFrames, LiveSource
+    from rdstitch.results.pose import Pose
     from rdstitch.results.registration import Registration
 
 Following = Annotated[
@@ -38,54 +37,24 @@ Idle = Annotated[
 ]
 
 
-@contextmanager
-def followed(
-    plan: "OutputPlan",
-    reporter: Reporter,
-    *,
-    idle: float | None,
-    preview: Path | None = None,
-    refresh: float = 0.0,
-    poses: "FollowedPoses | None" = None,
-) -> Iterator[list["Named"]]:
-    """Print a line for each frame as it arrives; then, inside the block, what all of them are as inputs of a recipe."""
-    from rdstitch.inputs.frame_stream import open_frame_stream
-    from rdstitch.pipeline.follow import follow
-    from rdstitch.system.file_access import file_state
-    from rdstitch.system.temporary_folder import TemporaryFolder
+def source_to_follow(inputs: Sequence[Path], every: int | None, idle: float | None) -> "LiveSource":
+    """The one input of ``--follow``."""
+    from rdstitch.pipeline.live_source import LiveSource
 
-    run = plan.run
-    if len(run.inputs) != 1:
+    if len(inputs) != 1:
         raise click.UsageError("--follow takes one input: a folder, a video, the index of a camera, a stream or -")
-    (given,) = map(str, run.inputs)  # as a path an address would lose one of its slashes
-    source, output = Path(given), plan.replaced_bag or next(iter((*plan.images, *plan.files)))
-    if source.is_dir() and output.resolve().parent == source.resolve():
-        raise click.UsageError(f"{output}: lies in the folder that is followed; choose a name in another folder")
-    with run.outputs:
-        plan.check()
-    for note in run.notes:
+    return LiveSource(str(inputs[0]), every, idle, sys.stdin)
+
+
+def print_followed(frames: "FollowedFrames", reporter: Reporter) -> None:
+    """Print a line for each frame as it arrives, until no more come, or the user interrupts."""
+    for note in frames.given.notes:
         reporter.tell(note)
-    before = None if preview is None else file_state(preview)
-    with TemporaryFolder() as folder:
-        arrivals = open_frame_stream(
-            given,
-            frames_folder=lambda: folder,
-            names=sys.stdin,
-            every=run.every or 1,
-            idle=idle,
-            topic=run.options.topic,
-        )
-        again = arrivals.comes_again
-        frames = follow(arrivals, run.options, poses, comes_again=again, preview=preview, refresh=refresh)
-        try:
-            with closing(frames):
-                _print_poses(frames, reporter)
-        except KeyboardInterrupt:
-            reporter.note("interrupted: registering what has arrived; interrupt once more to give up")
-        yield arrivals.inputs
-    # The image that it was a preview of is there now; a file that was not replaced is the user's.
-    if preview is not None and file_state(preview) != before:
-        preview.unlink(missing_ok=True)
+    try:
+        with closing(frames.poses):
+            _print_poses(frames.poses, reporter)
+    except KeyboardInterrupt:
+        reporter.note("interrupted: registering what has arrived; interrupt once more to give up")
 
 
 def _print_poses(frames: Iterable["Pose"], reporter: Reporter) -> None:

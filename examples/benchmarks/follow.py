@@ -25,6 +25,7 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.follow import follow
 from rdstitch.results.pose import Pose
 from rdstitch.system.process_memory import peak_memory
+from rdstitch.tracking.preview import LivePreview
 from rdstitch.trajectories.trajectory import Trajectory
 
 
@@ -66,9 +67,9 @@ def main(
             if not (file := images / f"frame_{index:05d}.jpg").exists():
                 write_image(file, drive.frame(index))
         arrivals = open_frame_stream(images, frames_folder=lambda: images, idle=0.5)
-        preview = images / ".preview.jpg"
+        preview = LivePreview(images / ".preview.jpg", 1.0)
         poses, spent, memory, last = list[Pose](), list[float](), 0.0, time.process_time()
-        for frame in follow(arrivals, options, preview=preview, refresh=1.0):
+        for frame in follow(arrivals, options, preview=preview):
             poses.append(frame)
             spent.append((now := time.process_time()) - last)
             last = now

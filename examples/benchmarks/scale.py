@@ -146,9 +146,9 @@ def aligned_by_drawn(
     sources = read_sources(frames, skip_bad=False)[0]
     options = options.for_images(count)
     aligner = Aligner.of(sources, options, Cache())
-    aligned = draft_with_loops(aligner, cast(PairEstimator, matches), pairs, matches.pairs)
+    draft = draft_with_loops(aligner, cast(PairEstimator, matches), pairs, matches.pairs)
     note("closing loops", 1, 1)
-    aligned = aligner.completed(aligned)
+    aligned = aligner.completed(draft)
     note("aligning", 1, 1)
     keypoints = tuple(len(points) for points, _ in matches.keypoints)
     registration = Registration(tuple(sources), keypoints, tuple(aligner.used(aligned)), aligned.alignment, ())

@@ -41,6 +41,15 @@ class AlignmentErrors:
     control_leverage: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False)
+class MapPlacement:
+    """Where an output lies on the Earth, or why that is not known."""
+
+    place: Georeference | None
+    reason: str = ""  # why there is none
+    contradiction: str = ""  # what speaks against it
+
+
 def place_on_map(
     sources: Sequence[Source],
     to_output: FloatArray,
@@ -48,13 +57,12 @@ def place_on_map(
     epsg: int | None = None,
     *,
     force: bool = False,
-) -> tuple[Georeference | None, str]:
+) -> MapPlacement:
     """Place the output on the Earth, or say why that cannot be done; control points, where there are any, count alone.
 
     ``sources`` are the N images that are used, with the cameras that were found; ``to_output`` (N, 3, 3) leads from
     normalized undistorted coordinates of each to pixels of the output. Without ``epsg`` the map is that of the control
-    points, else UTM (UPS near the poles) on WGS 84. With ``force`` positions that the images contradict place it too,
-    and the reason says so.
+    points, else UTM (UPS near the poles) on WGS 84. With ``force`` positions that the images contradict place it too.
     """
     points = _control_points(sources, to_output)
     control = [(point, pixel) for point, pixel in points if not point.check]
@@ -63,20 +71,20 @@ def place_on_map(
         count = sum(source.metadata.gps is not None for source in sources)
         what = f"{count} of {len(sources)} images have a GPS position"
     if count < MIN_POSITIONS:
-        return None, f"{what}, and {MIN_POSITIONS} are needed"
+        return MapPlacement(None, f"{what}, and {MIN_POSITIONS} are needed")
     views = views_of([source.camera for source in sources], to_output, [source.down for source in sources])
     if not control:
         return _placed(_of_positions(sources, views, errors), errors, epsg, force)
     if epsg is None and control[0][0].epsg != WGS84:
         epsg = control[0][0].epsg
-    place, reason = _placed(_of_control(control, views, errors), errors, epsg, force)
-    checks = [(point, pixel) for point, pixel in points if point.check]
+    found = _placed(_of_control(control, views, errors), errors, epsg, force)
+    place, checks = found.place, [(point, pixel) for point, pixel in points if point.check]
     if place is None or not checks:
-        return place, reason
+        return found
     latitude, longitude = np.array([(point.place.latitude, point.place.longitude) for point, _ in checks]).T
     off = place.to_map([(pixel.real, -pixel.imag) for _, pixel in checks]) - place.crs.project(latitude, longitude)
     residuals = (Residual.of(p.name, complex(*error), True) for (p, _), error in zip(checks, off.tolist(), strict=True))
-    return replace(place, checks=tuple(residuals)), reason
+    return replace(found, place=replace(place, checks=tuple(residuals)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,19 +131,17 @@ def _control_points(sources: Sequence[Source], to_output: FloatArray) -> list[tu
     ]
 
 
-def _placed(
-    known: _KnownPlaces, errors: AlignmentErrors, epsg: int | None, force: bool
-) -> tuple[Georeference | None, str]:
+def _placed(known: _KnownPlaces, errors: AlignmentErrors, epsg: int | None, force: bool) -> MapPlacement:
     source, names, views = known.source, known.names, known.views
     latitude, longitude = np.array([(place.latitude, place.longitude) for place in known.places]).T
     if source is PositionKind.GPS and not (np.ptp(latitude) or np.ptp(longitude)):
-        return None, "all images have the same GPS position"
+        return MapPlacement(None, "all images have the same GPS position")
     crs = Crs.nearest(latitude, longitude) if epsg is None else Crs(epsg)
     map_scale = crs.map_scale(*middle(latitude, longitude))
     places = crs.project(latitude, longitude) @ np.array([1, 1j])
     usable: BoolArray = np.isfinite(places) & np.isfinite(views.foot)
     if usable.sum() < MIN_POSITIONS:
-        return None, f"{crs.name} does not reach the {source}"
+        return MapPlacement(None, f"{crs.name} does not reach the {source}")
     altitude = np.array([np.nan if place.altitude is None else place.altitude for place in known.places])
     std = np.array([(np.nan, np.nan) if place.std is None else place.std for place in known.places])
     measured = Measured(places[usable], altitude[usable], std[usable], known.leverage[usable], map_scale)
@@ -143,18 +149,18 @@ def _placed(
     used, off = np.zeros(len(names), dtype=bool), np.full(len(names), complex(np.nan))
     used[usable], off[usable] = fit.used, fit.left_out
     if not used.any():
-        return None, f"no scale and direction of the map fit the {source} and the places of the images"
+        return MapPlacement(None, f"no scale and direction of the map fit the {source} and the places of the images")
     rms = math.sqrt(float(np.mean(np.abs(off[used]) ** 2)))
     spread = math.sqrt(float(np.mean(np.abs(places[used] - places[used].mean()) ** 2)))
-    reason = ""
+    contradiction = ""
     if used.sum() < max(MIN_POSITIONS, len(names) / 2) or not rms < _MAX_ERROR * spread:
         median = float(np.median(np.where(usable, np.abs(off), np.inf)))
-        reason = (
+        contradiction = (
             f"the {source} contradict the images: half of them are {metres(median)} or more from where the images put "
             f"them, which is much in an area of {metres(2.0 * spread)}"
         )
         if not force:
-            return None, f"{reason}; --georeference force places it nevertheless"
+            return MapPlacement(None, f"{contradiction}; --georeference force places it nevertheless")
     hills = errors.relief * views.pixel
     if errors.lever_std is not None and np.isfinite(views.height).any():
         hills = errors.lever_std * float(np.nanmedian(views.height))
@@ -176,4 +182,4 @@ def _placed(
         map_scale=map_scale,
         assumption=assumption,
     )
-    return place, reason
+    return MapPlacement(place, contradiction=contradiction)

@@ -26,6 +26,9 @@ Mask = Annotated[
         file=FileUse.READ,
     ),
 ]
+CAMERA_FILE = (
+    "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap, Hugin or lensfun; its lens is not estimated."
+)
 FlatField = Annotated[
     Literal["auto", "off"] | str | Path,
     Option(

@@ -11,7 +11,7 @@ from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.estimation_options import EstimationOptions, RansacOptions
 from rdstitch.options.feature_options import FeatureOptions
 from rdstitch.options.option import Contradiction, Range, Unit, documented, option, reads, writes
-from rdstitch.options.shared_options import ArrayChannels, Distortion, Mask, RunOptions
+from rdstitch.options.shared_options import CAMERA_FILE, ArrayChannels, Distortion, Mask, RunOptions
 from rdstitch.system.machine import processor_count
 
 if TYPE_CHECKING:
@@ -51,10 +51,7 @@ class StitchOptions(RansacOptions, RunOptions):
         "auto", "Lens to estimate: λ; λ and the distortion centre; besides them a second or a third coefficient."
     )
     model: ModelName = option("auto", "Motion model of the camera.")
-    camera: "Camera | str | Path | None" = reads(
-        "Camera file of rdstitch, OpenCV, ROS, Kalibr, COLMAP, OpenDroneMap, Hugin or lensfun; its lens is not "
-        "estimated."
-    )
+    camera: "Camera | str | Path | None" = reads(CAMERA_FILE)
     distortion: Distortion = None
     focal: float | None = option(
         None, "Focal length, pixels; otherwise from EXIF, or a guess.", "PX", within=Range(above=0.0)

@@ -1,7 +1,7 @@
 """Recomposing from a saved registration: other bands of the same flight, other sizes, other compositing options."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,12 @@ from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.canvas_options import CanvasOptions
 from rdstitch.options.option import declared, options_of, with_fields
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.composition.compose import CanvasPlan, compose_images
+from rdstitch.pipeline.composition.compose import CanvasLayout, compose_images
 from rdstitch.pipeline.composition.straighten import reoriented
-from rdstitch.pipeline.output_plan import OutputPlan
-from rdstitch.pipeline.replacements import read_replacements
-from rdstitch.pipeline.run import Run
-from rdstitch.pipeline.viewer_pages import plainly_viewed, write_page
+from rdstitch.pipeline.inputs.replacements import read_replacements
+from rdstitch.pipeline.outputs.output_files import OutputFiles
+from rdstitch.pipeline.outputs.viewer_pages import plainly_viewed, write_page
+from rdstitch.pipeline.run import RecipeInput, Run
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages, SavedGrid
 from rdstitch.sidecar.read import SavedRegistration, mismatch_with_image, read_sidecar
@@ -86,75 +86,70 @@ def apply(
         raise InputError(mismatch)
     chosen = options_of(CompositeOptions, composite or saved.composite, "composite")
     chosen = chosen.overridden(**composing)
-    run = apply_run(saved, None if output is None else Path(output), chosen, options, progress)
-    given = as_inputs(images, options.channel_order)
+    named = as_inputs(images, options.channel_order)
     if saved.record.stage is not None:
-        given = with_position_folders(given)
-    run = replace(run, inputs=given)
-    with run.open_images() as replacements:
-        OutputPlan.of_images(run, replacements.files).check()
+        named = with_position_folders(named)
+    settings = settings_of(saved, chosen, options)
+    files = [saved.path, *options.files, *settings.files]
+    given = RecipeInput(named, settings, every=options.every, files=files)
+    run = Run.of(given, output, progress=progress)
+    with given.find_images(run.output) as replacements, run.outputs:
+        OutputFiles.of_images(run, replacements.files).check()
         result = apply_to_images(saved, replacements, run, options)
     return replace(result, messages=(*([Message(mismatch)] if mismatch else []), *result.messages))
 
 
-def apply_run(
-    saved: SavedRegistration,
-    output: Path | None,
-    composite: CompositeOptions,
-    options: ApplyOptions,
-    progress: Progress,
-) -> Run:
-    """What the stages after registration take of the options."""
-    settings = StitchOptions(
+def settings_of(saved: SavedRegistration, composite: CompositeOptions, options: ApplyOptions) -> StitchOptions:
+    """The options of the stages after registration."""
+    return StitchOptions(
         composite=composite,
         reference=saved.images[saved.reference].name,
         channel_order=options.channel_order,
         **options.of_run,
     )
-    run = Run.of((), settings, output=output, every=options.every, progress=progress)
-    return replace(run, read=[saved.path, *options.files, *settings.files])
 
 
 def apply_to_images(saved: SavedRegistration, images: FoundImages, run: Run, options: ApplyOptions) -> Recomposition:
-    """Compose images that were found by a saved registration, into memory or among the outputs."""
+    """Compose the images found by a saved registration; with a file as output, stage it."""
     output = run.output
     given = read_replacements(saved, images.frames, options, run.guard, run.options.composite.max_memory)
     placed = saved.record.output.place is not None
-    OutputPlan.of_images(run, ()).check_places(list(given.sources.values()), placed=placed)
-    lens, of_lens = _lens_of_band(saved, given.sources, run.progress)
-    plan, of_turn = _laid_out(saved, given.sources, lens, run.options.composite)
-    composed, of_output = compose_images(plan, run)
-    sources = dict(zip(given.sources, plan.placed.sources, strict=True))
+    OutputFiles.of_images(run, ()).check_places(list(given.sources.values()), placed=placed)
+    band = _compare_bands(saved, given.sources, run.progress)
+    layout, of_turn = _laid_out(saved, given.sources, band.lens, run.options.compositing)
+    composed, of_output = compose_images(layout, run)
+    of_band = [] if band.note is None else [band.note]
+    sources = dict(zip(given.sources, layout.placed.sources, strict=True))
     result = Recomposition(
         saved=saved,
         sources=tuple(map(sources.get, range(len(saved.images)))),
         matched=given.matched,
         left_out=given.left_out,
-        messages=(*given.messages, *of_lens, *of_turn, *images.messages, *run.guard.messages, *of_output),
+        messages=(*given.messages, *of_band, *of_turn, *images.messages, *run.guard.messages, *of_output),
         **composed.fields,
     )
     if options.dry_run or output is None:
         return result
     page = partial(plainly_viewed, result.canvas, [source.name for source in sources.values()])
     result = replace(result, messages=(*result.messages, *write_page(result, run.outputs, page)))
-    run.outputs.write(f"{output}.json", json_bytes(applied_sidecar(result, same_lens=lens is None)))
+    run.outputs.write(f"{output}.json", json_bytes(applied_sidecar(result, same_lens=band.lens is None)))
     return result
 
 
 def _laid_out(
     saved: SavedRegistration, sources: Mapping[int, Source], lens: BandLens | None, composite: CompositeOptions
-) -> tuple[CanvasPlan, list[Message]]:
-    """Where the images lie, by the sidecar and the lens of their band."""
+) -> tuple[CanvasLayout, list[Message]]:
+    """Lay the images out as the sidecar has them, corrected for the lens of their band."""
     if lens is not None:
         sources = {index: replace(source, camera=lens.camera(source.camera)) for index, source in sources.items()}
     placed, of_turn = reoriented(_placed(saved, sources, lens), composite, saved.composite)
     if (grid := _same_grid(saved, sources, composite)) is not None:
         placed = replace(placed, grid=grid)
-    return CanvasPlan.of(placed, composite), of_turn
+    return CanvasLayout.of(placed, composite), of_turn
 
 
 def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: CompositeOptions) -> SavedGrid | None:
-    """The pixels of the saved output, where images of the same sizes are to have the same: bands, and dates."""
+    """The pixel grid of the saved output, if images of the same sizes and options are to be on the same one."""
     matrix, size = saved.plane_to_output, saved.record.output.size
     same_sizes = all(saved.images[index].size == source.camera.image_size for index, source in used.items())
     alike = same_sizes and not saved.turned and options.agrees(saved.composite, CanvasOptions)
@@ -162,19 +157,25 @@ def _same_grid(saved: SavedRegistration, used: Mapping[int, Source], options: Co
     return SavedGrid(matrix, size, place) if alike and matrix is not None and size is not None else None
 
 
-def _lens_of_band(
-    saved: SavedRegistration, used: Mapping[int, Source], progress: Progress
-) -> tuple[BandLens | None, list[Message]]:
-    """The lens that took the given images, where that is another one than took those that were registered."""
+@dataclass(frozen=True)
+class _BandComparison:
+    """What the lens of the given images is, against that of the registered ones."""
+
+    lens: BandLens | None = None  # None: the same, as far as is known
+    note: Message | None = None
+
+
+def _compare_bands(saved: SavedRegistration, used: Mapping[int, Source], progress: Progress) -> _BandComparison:
+    """Estimate the lens of the given images, if it is not the one that took the registered images."""
     if saved.record.stage is not None:
-        return None, []  # channels of a microscope have their places in common, not their content
+        return _BandComparison()  # channels of a microscope have their places in common, not their content
     frames = {index: source.frame or Frame(source.path) for index, source in used.items()}
     files = files_of(frame for frame in frames.values() if frame.number is None)
     originals = {k: file for k in frames if (file := saved.original(saved.images[k])) is not None}
     if files and not originals:
         name = saved.images[next(iter(frames))].path
         text = f"the registered images are not there any more ({name}, …): whether the same lens took the given ones, "
-        return None, [Message(f"{saved.path}: {text}from the same places, was not compared", severity="note")]
+        return _not_compared(saved, f"{text}from the same places, was not compared")
     elsewhere = {k: file for k, file in originals.items() if file.resolve() != frames[k].path.resolve()}
     pairs: dict[int, tuple[Source, Source]] = {}
     for index, file in elsewhere.items():
@@ -186,15 +187,19 @@ def _lens_of_band(
     lens = band_lens(pairs, lambda done, total: progress("comparing bands", done, total))
     if lens is None and pairs:
         text = "the given images show nothing that the registered ones do: whether the same lens took them is not known"
-        return None, [Message(f"{saved.path}: {text}", severity="note")]
+        return _not_compared(saved, text)
     if lens is None or lens.is_same:
-        return None, []
+        return _BandComparison()
     text = f"{lens.shift:.1f} pixels (median) from the registered band, {lens.error:.1f} with its lens registered too"
-    return lens, [Message(text, severity="note", code="band-lens")]
+    return _BandComparison(lens, Message(text, severity="note", code="band-lens"))
+
+
+def _not_compared(saved: SavedRegistration, text: str) -> _BandComparison:
+    return _BandComparison(note=Message(f"{saved.path}: {text}", severity="note"))
 
 
 def _placed(saved: SavedRegistration, used: Mapping[int, Source], lens: BandLens | None) -> PlacedImages:
-    """The images at the places that the sidecar has for them, or that the lens of a band gives them."""
+    """The images with the homographies of the sidecar, corrected for the lens of their band."""
     to_registered = np.eye(3) if lens is None else np.linalg.inv(lens.homography)
     return PlacedImages(
         list(used.values()),

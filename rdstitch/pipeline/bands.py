@@ -1,4 +1,4 @@
-"""All bands of a rig of cameras: the first is registered, the lenses of the others to it, and all have one grid."""
+"""Mosaics of all bands of a multispectral rig on one pixel grid: the first band is registered, the others follow."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -24,10 +24,10 @@ from rdstitch.io.write_ome import OME_SUFFIXES
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.apply_sidecar import apply_run, apply_to_images
-from rdstitch.pipeline.output_plan import file_of_part
+from rdstitch.pipeline.apply_sidecar import apply_to_images, settings_of
+from rdstitch.pipeline.outputs.output_files import file_of_part
 from rdstitch.pipeline.recipes import stitch_images
-from rdstitch.pipeline.run import Run
+from rdstitch.pipeline.run import RecipeInput, Run
 from rdstitch.results.messages import Message
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.sidecar.read import read_sidecar
@@ -36,16 +36,6 @@ from rdstitch.sidecar.write import sidecar
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, json_bytes
 from rdstitch.system.progress import Progress, silent
-
-
-def parse_bands(text: str) -> dict[str, str]:
-    """Patterns of images by the names of bands, of ``NIR=*_NIR.TIF,RED=*_RED.TIF``."""
-    pairs = [part.partition("=") for part in text.split(",")]
-    bands = {name.strip(): pattern.strip() for name, _, pattern in pairs}
-    complete = len(bands) == len(pairs) > 1 and all(bands) and all(bands.values())
-    if not complete or {"/", "\\"} & set("".join(bands)):
-        raise ArgumentError(f"--bands: {text!r} is not a list like NIR=*_NIR.TIF,RED=*_RED.TIF")
-    return bands
 
 
 @one_native_thread()
@@ -67,26 +57,26 @@ def mosaic_bands(
     """
     file = Path(output)
     files = [file_of_part(file, name) for name in bands]
-    run = Run.of(inputs, options, Purpose.MOSAIC, files[0], beside=beside, every=every, progress=progress)
+    given = RecipeInput.of(inputs, options, Purpose.MOSAIC, every)
+    run = Run.of(given, files[0], beside, progress)
     options, outputs = run.options, run.outputs
     if options.dry_run:
         raise ArgumentError("bands have no plan before the first of them is registered: leave out dry_run")
     stack = [file, Path(f"{file}.json")] if file.suffix.lower() in (".tif", ".tiff") else []
-    with run.open_images(file, *files[1:]) as images:  # all are published together
+    with given.find_images(file, *files) as images, outputs:  # all are published together
         frames = selected(images.frames, options.exclude, options.include_only)
         chosen = _by_band(frames, bands)
         is_ome = file.name.lower().endswith(OME_SUFFIXES)
         _check_alike(dict(zip(bands, chosen, strict=True)), in_one_file=bool(stack), is_ome=is_ome)
-        whole = replace(run.options, exclude=(), include_only=())
-        run = replace(run, options=whole, read=[*run.read, *images.files])
-        of_first = replace(images, frames=chosen[0])
-        first = stitch_images(of_first, run, more_images=files[1:], more_files=stack)
+        of_first = replace(images, frames=chosen[0], containers=tuple(images.files))
+        run_of_first = run.of_part(files[0], replace(options, exclude=(), include_only=()), run.beside)
+        first = stitch_images(of_first, run_of_first, more_images=files[1:], more_files=stack)
         saved = replace(read_sidecar(outputs.where(f"{files[0]}.json")), path=Path(f"{files[0]}.json"))
         same = ApplyOptions(mask=options.mask, channel_order=options.channel_order, **options.of_run)
-        runs = (replace(apply_run(saved, name, saved.composite, same, progress), outputs=outputs) for name in files[1:])
+        settings = settings_of(saved, saved.composite, same)
         others = tuple(
-            apply_to_images(saved, FoundImages(band, []), of_band, same)
-            for band, of_band in zip(chosen[1:], runs, strict=True)
+            apply_to_images(saved, FoundImages(band, []), run.of_part(name, settings), same)
+            for band, name in zip(chosen[1:], files[1:], strict=True)
         )
         if stack:
             _stage_stack(file, dict(zip(bands, files, strict=True)), first, outputs)
@@ -95,7 +85,7 @@ def mosaic_bands(
 
 
 def _check_alike(bands: Mapping[str, list[Frame]], *, in_one_file: bool, is_ome: bool) -> None:
-    """Refuse before long work bands whose images have other sizes than the first's, or which one file cannot hold."""
+    """Refuse bands whose images differ in size from the first, or that one file cannot hold."""
     kinds = {}
     for name, frames in bands.items():
         sources, unread = read_sources(frames, skip_bad=True)
@@ -120,7 +110,7 @@ def _check_alike(bands: Mapping[str, list[Frame]], *, in_one_file: bool, is_ome:
 
 
 def _stage_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, outputs: Outputs) -> None:
-    """One file of all bands, which are staged; what one of them does not show is transparent."""
+    """Stage one file of all bands, which are staged already; it is transparent where any band is."""
 
     def joined(parts: Sequence[Strip]) -> Strip:
         alphas = [alpha for _, alpha in parts if alpha is not None]
@@ -144,7 +134,7 @@ def _stage_stack(file: Path, bands: Mapping[str, Path], first: StitchResult, out
 
 
 def _by_band(frames: Sequence[Frame], bands: Mapping[str, str]) -> list[list[Frame]]:
-    """The images of each band; none may be of two."""
+    """Assign images to bands; none may belong to two."""
     chosen: dict[str, list[Frame]] = {name: [] for name in bands}
     for frame in frames:
         fitting = [name for name in bands if fnmatchcase(frame.name.rpartition("/")[2].lower(), bands[name].lower())]

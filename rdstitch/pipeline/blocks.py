@@ -1,21 +1,22 @@
-"""Every block of images that overlap: the largest, and again of what it left out."""
+"""Mosaics of every connected block of images: the largest first, then of what it left out."""
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 from rdstitch.choices import Purpose
 from rdstitch.errors import InputError, OutputError, RdstitchError, RegistrationError
+from rdstitch.inputs.find import FoundImages
 from rdstitch.inputs.frame import Frame, Images
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.times import with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.output_plan import file_of_part
+from rdstitch.pipeline.outputs.output_files import file_of_part
 from rdstitch.pipeline.recipes import stitch_images
-from rdstitch.pipeline.run import Run
+from rdstitch.pipeline.run import RecipeInput, Run
 from rdstitch.results.messages import Message
+from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.progress import Progress, silent
@@ -48,59 +49,58 @@ def mosaic_blocks(
         The largest block first, without which there is an error. Images that are in no block are named in it.
     """
     file = Path(output)
-    results: list[StitchResult] = []
-    refused: list[Message] = []
-    run = Run.of(inputs, options, Purpose.MOSAIC, file, beside=beside, every=every, progress=progress)
-    options = run.options
-    with run.open_images() as images, ExitStack() as stack:  # all are published together, once the cache is gone
-        # What was found of images and pairs serves the next block.
-        cache = options.cache or stack.enter_context(TemporaryFolder())
-        images = replace(
-            images, frames=list(with_times(images.frames, options.timestamps)), notes=(*images.notes, *run.notes)
-        )
+    given = RecipeInput.of(inputs, options, Purpose.MOSAIC, every)
+    whole = Run.of(given, file, beside, progress)
+    # All are published together, once the cache is gone; what was found of images and pairs serves the next block.
+    with given.find_images(file) as images, whole.outputs, TemporaryFolder() as cache:
+        images = replace(images, frames=list(with_times(images.frames, whole.options.timestamps)))
+        options = replace(whole.options, timestamps=None)
         frames = selected(images.frames, options.exclude, options.include_only)
         names = [file, *(file_of_part(file, k) for k in range(2, len(frames) // 2 + 1))]
-        cached = replace(run.options, cache=cache, timestamps=None)
-        run = replace(run, options=cached, notes=(), keeps_cache=options.cache is not None)
-        further = names[1:]
-        remaining = replace(images, outputs=[], notes=())
-        while len(frames) > 1 or not results:
-            run = replace(run, output=names[len(results)])
+        run = whole.of_part(file, options, whole.beside, cache)
+        results = [stitch_images(replace(images, outputs=[], notes=()), run, more_images=names[1:])]
+        refused: list[Message] = []
+        frames = _not_used(frames, results[0].registration)
+        options = _for_further_blocks(options)
+        while len(frames) > 1:
+            run = whole.of_part(names[len(results)], options, temporary_cache=cache)
             try:
-                with run.outputs.together():
-                    result = stitch_images(remaining, run, more_images=further)
-                registration = result.registration
-            except RdstitchError as error:
-                if not results or isinstance(error, OutputError):
-                    raise
-                if not isinstance(error, RefusedError):
-                    # That the rest does not overlap, or cannot be read, the first block has said.
-                    if not isinstance(error, RegistrationError | InputError):
-                        refused.append(Message(f"there are no blocks after the {len(results)} first: {error}"))
-                    break
+                with whole.outputs.together():
+                    result = stitch_images(FoundImages(frames, [], images.containers), run)
+            except RefusedError as error:
                 registration = error.registration
                 refused.append(Message(f"a further block of {registration.alignment.used.sum()} images: {error}"))
+            except (RegistrationError, InputError):
+                break  # that the rest does not overlap, or cannot be read, the first block has said
+            except OutputError:
+                raise
+            except RdstitchError as error:
+                refused.append(Message(f"there are no blocks after the {len(results)} first: {error}"))
+                break
             else:
+                registration = result.registration
                 results.append(result)
-            pairs = zip(registration.sources, registration.alignment.used, strict=True)
-            used = [source.frame or Frame(source.path) for source, used in pairs if used]
-            done = {(frame.path, frame.number) for frame in used}
-            frames = [frame for frame in frames if (frame.path, frame.number) not in done]
-            remaining = replace(remaining, frames=frames)
-            # These are of the first block, or of its reference image.
-            run, further = replace(run, options=_for_further_blocks(run.options), beside=NOTHING_BESIDE), []
+            frames = _not_used(frames, registration)
     return _naming_left_out_once(results, [*images.messages, *refused])
 
 
+def _not_used(frames: Sequence[Frame], registration: Registration) -> list[Frame]:
+    """The frames that a registration does not use."""
+    pairs = zip(registration.sources, registration.alignment.used, strict=True)
+    used = [source.frame or Frame(source.path) for source, is_used in pairs if is_used]
+    done = {(frame.path, frame.number) for frame in used}
+    return [frame for frame in frames if (frame.path, frame.number) not in done]
+
+
 def _for_further_blocks(options: StitchOptions) -> StitchOptions:
-    """Without what is of the first block alone: its camera file, what its reference image shows, patterns of names."""
+    """The options without what concerns the first block alone: camera file, reference image, patterns of names."""
     lines = options.composite.straighten if options.composite.straighten in ("off", "auto") else "off"
     composite = replace(options.composite, rectangle=None, straighten=lines)
     return replace(options, save_camera=None, reference=None, composite=composite, exclude=(), include_only=())
 
 
 def _naming_left_out_once(results: Sequence[StitchResult], messages: Sequence[Message]) -> tuple[StitchResult, ...]:
-    """Blocks of which the first names the images that are in none, and has messages on all."""
+    """The blocks; the first names the images that are in none, and has the messages on all."""
     placed = {str(source.path) for result in results for source in result.placed.sources}
     named = []
     for block, result in enumerate(results):

@@ -1,20 +1,16 @@
-"""The path of the camera, from where its images lie and along the wheel odometry of the same drive."""
+"""The path of the camera, by its alignment and the wheel odometry of the same drive."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 
 from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.errors import InputError
-from rdstitch.inputs.frame import Named, frame_numbers
+from rdstitch.inputs.frame import frame_numbers
 from rdstitch.inputs.odometry import Odometry
-from rdstitch.inputs.rosbag import odometry_in_bag, only_bag
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import timestamps_of
-from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message, shortened
 from rdstitch.results.registration import Registration
 from rdstitch.trajectories.odometry_fit import along_odometry
@@ -22,22 +18,10 @@ from rdstitch.trajectories.trajectory import Trajectory
 from rdstitch.verification.limits import Limits
 
 
-def with_odometry_of_bag(inputs: Iterable[Named], options: StitchOptions) -> StitchOptions:
-    """Options with the odometry of a topic, if one is named, of the bag that is the input."""
-    topic = options.odometry
-    if topic is None or isinstance(topic, Odometry) or Path(topic).is_file() or not str(topic).startswith("/"):
-        return options
-    if (bag := only_bag(inputs)) is None:
-        raise InputError(f"{topic}: no such file; a topic of odometry needs one ROS bag as input")
-    return replace(options, odometry=odometry_in_bag(bag, str(topic)))
-
-
 def camera_path(
     registration: Registration, odometry: Odometry | None, height: float | None
 ) -> tuple[Trajectory, list[Message]]:
-    """The path with names, numbers and times of the images, in ``height`` of the first one or the unit of the odometry;
-    and what the user should know of it.
-    """
+    """The path, labelled by the images, in units of ``height`` of the first image or of the odometry; with messages."""
     sources, messages = registration.sources, _scale_uncertainty(registration.alignment)
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     stored = QuarterTurns.of(sources).back.alignment(registration.alignment)
@@ -53,7 +37,7 @@ def camera_path(
 def _along_odometry(
     path: Trajectory, sources: Sequence[Source], odometry: Odometry, length_std: float, *, keep_unit: bool
 ) -> tuple[Trajectory, list[Message]]:
-    """The path in the unit of the odometry, unless that is to be kept, with poses of all frames that it leads to."""
+    """Fuse the path with odometry: its unit, unless ``keep_unit``, and poses of frames without one."""
     times = timestamps_of(sources)
     bodies = {k: body for k, time in enumerate(times.tolist()) if (body := odometry.at(time)) is not None}
     if not bodies:
@@ -75,7 +59,7 @@ def _along_odometry(
 
 
 def _scale_uncertainty(alignment: Alignment) -> list[Message]:
-    """A warning where the focal length, and with it the length of every step, is hardly known."""
+    """Warn if the focal length, and with it the scale of the path, is hardly known."""
     if not alignment.length_std > Limits.max_length_std:
         return []
     off = f"all lengths may be off together by {alignment.length_std:.0%}"

@@ -1,4 +1,4 @@
-"""Register once, compose for ever: sets of images from the same cameras in the same places."""
+"""Composing many sets of images from the same cameras in the same places, by one registration."""
 
 from collections.abc import Iterable
 from dataclasses import replace

@@ -31,8 +31,8 @@ from rdstitch.inputs.times import time_of, timestamps_of
 from rdstitch.io.opening import check_readable
 from rdstitch.options.option import options_of
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.given_camera import with_camera
-from rdstitch.pipeline.read_inputs import read_frames
+from rdstitch.pipeline.inputs.camera_and_odometry import with_camera
+from rdstitch.pipeline.inputs.read_inputs import read_frames
 from rdstitch.pipeline.registration.alignment_inputs import alignment_options
 from rdstitch.pipeline.registration.working_size import at_working_size
 from rdstitch.results.messages import Message
@@ -50,17 +50,14 @@ def follow(
     poses: FollowedPoses | None = None,
     *,
     comes_again: Callable[[Frame], bool] = lambda frame: False,
-    preview: Path | None = None,
-    refresh: float = 5.0,
+    preview: LivePreview | None = None,
 ) -> Generator[Pose]:
-    """Register frames as they arrive: a pose for each, and more for those that find their place, or another one, later.
+    """Register frames as they arrive: a pose for each, and another for each frame that is placed or moved later.
 
     Features are fewer than in a recipe, loops are not closed, and memory does not grow with the number of frames.
-    ``comes_again`` says whether a frame that could not be read whole will come again; ``preview`` is written every
-    ``refresh`` seconds at most.
+    ``comes_again`` says whether a frame that could not be read whole will come again.
     """
     tracker = Tracker(options, poses, patient=True)
-    live_preview = None if preview is None else LivePreview(preview, refresh)
     numbers = count()
     unread: dict[Path, int] = {}  # numbers of frames that come again
     of_preview: list[Message] = []  # told with the next frame
@@ -70,8 +67,8 @@ def follow(
             continue
         frame = arrived if arrived.number is not None else replace(arrived, number=number)
         read = tracker.read(frame)
-        source = read.source
-        if (read.image is None or (source is not None and source.guard.messages)) and comes_again(arrived):
+        source, is_whole = read.source, isinstance(read, ReadFrame) and not read.source.guard.messages
+        if not is_whole and comes_again(arrived):
             unread[arrived.path] = number
             continue
         poses_of_frame = tracker.register(read)
@@ -79,26 +76,33 @@ def follow(
         yield from poses_of_frame
         of_preview = []
         if source is not None:
-            if live_preview is not None:
-                of_preview = live_preview.add(source, poses_of_frame[-1].tracked)
+            if preview is not None:
+                of_preview = preview.add(source, poses_of_frame[-1].tracked)
             source.decoded_images.clear()
     yield from tracker.finish()
-    if live_preview is not None:
+    if preview is not None:
         with suppress(RdstitchError):  # what it was a preview of comes now
-            live_preview.write()
+            preview.write()
 
 
 class ReadFrame(NamedTuple):
     """A frame that arrived, as it is tracked."""
 
     frame: Frame
-    source: Source | None = None
-    image: PreparedImage | None = None
-    problem: str = ""  # why there is no image
+    source: Source
+    image: PreparedImage
+
+
+class UnreadFrame(NamedTuple):
+    """A frame that arrived, but cannot be tracked."""
+
+    frame: Frame
+    problem: str
+    source: Source | None = None  # where its header was read
 
 
 class Tracker:
-    """Registers frames of one camera as they come; what :func:`follow` does of one source.
+    """Registers the frames of one camera as they arrive; :func:`follow` does so for a source.
 
     Parameters
     ----------
@@ -148,7 +152,7 @@ class Tracker:
 
     @property
     def messages(self) -> tuple[Message, ...]:
-        """What the user should know of all that has come so far."""
+        """What the user should know of all frames so far."""
         return (*self._notes, *self._frames.messages)
 
     def add(
@@ -194,14 +198,14 @@ class Tracker:
         self.revised = tuple(revised)
         return pose
 
-    def read(self, frame: Frame, attitude: Sequence[float] | None = None) -> ReadFrame:
-        """The frame as a source, and as it is tracked; or why it is not."""
+    def read(self, frame: Frame, attitude: Sequence[float] | None = None) -> ReadFrame | UnreadFrame:
+        """Read and prepare a frame for tracking."""
         options, features = self._options, self._detection
         if options.timestamps is not None and (time := time_of(frame, options.timestamps)) is not None:
             frame = replace(frame, timestamp=time)
         sources, unread = read_frames([frame], options, InputGuard(options.strict), skip_bad=True)
         if not sources:
-            return ReadFrame(frame, problem=unread[0].text)
+            return UnreadFrame(frame, unread[0].text)
         source, megapixels = sources[0], self._megapixels
         try:
             if attitude is not None:
@@ -211,7 +215,7 @@ class Tracker:
             image = prepare(view, megapixels, stretch=features.stretch, equalize=bool(features.equalize))
             return ReadFrame(frame, source, image)
         except InputError as error:
-            return ReadFrame(frame, source, problem=str(error))
+            return UnreadFrame(frame, str(error), source)
 
     def _with_measurements(self, source: Source) -> list[Source]:
         """The frame with its mask and attitude."""
@@ -219,23 +223,23 @@ class Tracker:
         (source,) = with_masks([source], options.mask, all_known=False)
         return [source] if source.attitude is not None else with_attitudes([source], options.attitude)
 
-    def register(self, read: ReadFrame, body: BodyPose | None = None) -> list[Pose]:
-        """Register a frame that was read; it comes last, after those before it whose place is new."""
-        source, image = read.source, read.image
-        label = Pose(read.frame.name, read.frame.number or 0, math.nan, TrackingResult(), read.problem, self._poses)
-        if source is None or image is None:
-            return [label]
-        label = replace(label, name=source.name, timestamp=float(timestamps_of([source])[0]))
+    def register(self, read: ReadFrame | UnreadFrame, body: BodyPose | None = None) -> list[Pose]:
+        """Register a frame that was read; its pose comes last, after those of earlier frames that changed."""
+        number = read.frame.number or 0
+        if isinstance(read, UnreadFrame):
+            return [Pose(read.frame.name, number, math.nan, problem=read.problem, poses=self._poses)]
+        source = read.source
+        label = Pose(source.name, number, float(timestamps_of([source])[0]), poses=self._poses)
         camera = at_working_size(source.camera, self._megapixels)
         attitude = None if source.attitude is None else source.attitude.at_delays
         if body is None and (odometry := as_odometry(self._options.odometry)) is not None:
             body = odometry.at(label.timestamp)
-        results = self._frames.add(image, camera, attitude, body)
+        results = self._frames.add(read.image, camera, attitude, body)
         self._labels[results[-1].number] = label
         return self._poses_of(results)
 
     def finish(self) -> tuple[Pose, ...]:
-        """Poses of frames that find their place, or another one, when no other frame comes."""
+        """Poses of the frames that are placed or moved once no more frames arrive."""
         return tuple(self._poses_of(self._frames.finish()))
 
     def _poses_of(self, results: Sequence[TrackingResult]) -> list[Pose]:

@@ -12,29 +12,28 @@ from rdstitch.errors import RegistrationError
 from rdstitch.export.trajectory_files import has_times, path_as_svg, write_trajectory
 from rdstitch.inputs.find import FoundImages
 from rdstitch.inputs.frame import Images, frame_numbers
-from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.odometry import as_odometry
 from rdstitch.inputs.selection import selected
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.times import with_times
 from rdstitch.options.files_beside import NOTHING_BESIDE, FilesBeside, ReportFile
-from rdstitch.options.option import check_parameter, options_of
+from rdstitch.options.option import check_parameter
 from rdstitch.options.shared_options import Height
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.camera_path import camera_path
 from rdstitch.pipeline.composition.choose_layout import choose_layout
 from rdstitch.pipeline.composition.compose import compose_images
-from rdstitch.pipeline.composition.lay_out import CandidateLayout
+from rdstitch.pipeline.composition.lay_out import RegistrationLayout
 from rdstitch.pipeline.composition.map_canvas import check_map
-from rdstitch.pipeline.output_plan import OutputPlan, report_refused, save_camera, stage_report
-from rdstitch.pipeline.read_inputs import in_order, read_inputs
+from rdstitch.pipeline.inputs.read_inputs import in_order, read_inputs
+from rdstitch.pipeline.outputs.output_files import OutputFiles, report_refused, save_camera, stage_report
+from rdstitch.pipeline.outputs.viewer_pages import viewed_images, write_page
 from rdstitch.pipeline.registration.accept import accept
 from rdstitch.pipeline.registration.realign import aligner_of, with_reference_of
 from rdstitch.pipeline.registration.register import register
 from rdstitch.pipeline.registration.working_size import at_full_size
-from rdstitch.pipeline.run import Run
+from rdstitch.pipeline.run import RecipeInput, Run
 from rdstitch.pipeline.run_on_sources import blocks_on
-from rdstitch.pipeline.viewer_pages import viewed_images, write_page
 from rdstitch.results.messages import Message, merge_by_reason
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
@@ -93,9 +92,7 @@ def pano(
     >>> result.image.shape[2], result.ok
     (3, True)
     """
-    run = Run.of(inputs, options, Purpose.PANO, output, beside=beside, every=every, progress=progress)
-    with run.open_images() as images:
-        return stitch_images(images, run)
+    return _stitch(RecipeInput.of(inputs, options, Purpose.PANO, every), output, beside, progress)
 
 
 @one_native_thread()
@@ -132,33 +129,33 @@ def mosaic(
     >>> result.output.name, result.registration.alignment.used.all()
     ('small.tif', np.True_)
     """
-    run = Run.of(inputs, options, Purpose.MOSAIC, output, beside=beside, every=every, progress=progress)
-    with run.open_images() as images:
+    return _stitch(RecipeInput.of(inputs, options, Purpose.MOSAIC, every), output, beside, progress)
+
+
+def _stitch(given: RecipeInput, output: str | Path | None, beside: FilesBeside, progress: Progress) -> StitchResult:
+    run = Run.of(given, output, beside, progress)
+    with given.find_images(run.output) as images, run.outputs:
         return stitch_images(images, run)
 
 
 def stitch_images(
     images: FoundImages, run: Run, *, more_images: Sequence[Path] = (), more_files: Sequence[Path] = ()
 ) -> StitchResult:
-    """Stitch images that were found into an output of a run; more images, and files, may be written after it."""
+    """Stitch images into the output of a run; ``more_images`` and ``more_files`` may be written after it."""
     options = run.options
     frames = in_order(with_times(images.frames, options.timestamps))
     names = [frame.name for frame in selected(frames, options.exclude, options.include_only)]
-    plan = OutputPlan.of_images(run, images.files, names, more_images, more_files)
-    plan.check()
-    run = replace(run, guard=InputGuard(options.strict))
+    files = OutputFiles.of_images(run, images.files, names, more_images, more_files)
+    files.check()
     sources, unread = read_inputs(frames, options, run.guard, skip_bad=run.purpose is not Purpose.PANO)
-    plan.check_places(sources)
+    files.check_places(sources)
     check_map(sources, options.composite)
-    if run.beside.frame == "first":
-        run = replace(run, options=replace(options, reference=sources[0].name))
-    known = [*unread, *images.messages, *run.notes]
     with run.executor(len(sources)) as executor:
-        with _failures_explained(run, known):
-            accepted, run = _register_and_check(sources, known, run, executor)
+        with _failures_explained(run, unread):
+            accepted, run = _register_and_check(sources, [*unread, *images.messages], run, executor)
             run.progress("laying out", 0, 1)
-            chosen = choose_layout(accepted, run.options, aligner_of(accepted, run.options, run.purpose))
-        return compose_registration(chosen, run, plan, executor)
+            chosen = choose_layout(accepted, run.options, aligner_of(accepted, run))
+        return compose_registration(chosen, run, files, executor)
 
 
 @one_native_thread()
@@ -185,9 +182,10 @@ def calibrate(
         With the cameras and poses in ``alignment``.
     """
     files = FilesBeside.of(ReportFile, beside, "calibrate")
-    run = Run.of(inputs, options, Purpose.CALIBRATE, beside=files, every=every, progress=progress)
-    with run.open_images() as images:
-        OutputPlan.of_images(run, images.files).check()
+    given = RecipeInput.of(inputs, options, Purpose.CALIBRATE, every)
+    run = Run.of(given, beside=files, progress=progress)
+    with given.find_images() as images, run.outputs:
+        OutputFiles.of_images(run, images.files).check()
         result = _register_at_full_size(images, run)
         save_camera(result, run)
         return result.with_messages(stage_report(run, result))
@@ -199,7 +197,7 @@ def trajectory(
     output: str | Path | None = None,
     options: StitchOptions | None = None,
     *,
-    layout: TrajectoryFormat = "csv",
+    file_format: TrajectoryFormat = "csv",
     plot: str | Path | None = None,
     height: float | None = None,
     frame: TrajectoryFrame | None = None,
@@ -214,7 +212,7 @@ def trajectory(
         As for :func:`mosaic`, but that every frame of a video is used unless ``every`` says otherwise.
     output : path, optional
         File to write.
-    layout : str
+    file_format : str
         "csv", "tum", "kitti" or "bag", see :mod:`rdstitch.export.trajectory_files`.
     plot : path, optional
         SVG file to draw the path to.
@@ -229,22 +227,22 @@ def trajectory(
     Trajectory, Registration
         The path, and the registration that it comes from.
     """
-    for name, kind, value in (("layout", TrajectoryFormat, layout), ("height", Height, height)):
+    for name, kind, value in (("file_format", TrajectoryFormat, file_format), ("height", Height, height)):
         check_parameter(name, kind, value)
     check_parameter("frame", TrajectoryFrame | None, frame)
-    options = replace(options_of(StitchOptions, options), pose_covariance=True)
-    run = Run.of(inputs, options, Purpose.TRAJECTORY, every=every, progress=progress)
-    with run.open_images() as images:
-        OutputPlan.of_path(run, images.files, output, plot, layout).check()
+    given = RecipeInput.of(inputs, options, Purpose.TRAJECTORY, every)
+    run = Run.of(given, progress=progress)
+    with given.find_images() as images, run.outputs:
+        OutputFiles.of_path(run, images.files, output, plot, file_format).check()
         odometry = as_odometry(run.options.odometry)
         numbers = frame_numbers(images.frames)
         numbered = [replace(frame, number=k) for frame, k in zip(images.frames, numbers, strict=True)]
         registration = _register_at_full_size(replace(images, frames=numbered), run)
         path, messages = camera_path(registration, odometry, height)
-        if layout in ("tum", "bag") and not has_times(path):
+        if file_format in ("tum", "bag") and not has_times(path):
             messages.append(_NO_TIMES)
         if output is not None:
-            write_trajectory(path, Path(output), layout, frame, run.outputs)
+            write_trajectory(path, Path(output), file_format, frame, run.outputs)
         save_camera(registration, run)
         if plot is not None:
             drawn = text_bytes(path_as_svg(path, "heights" if height is None else "m"))
@@ -253,22 +251,20 @@ def trajectory(
 
 
 def _register_at_full_size(images: FoundImages, run: Run) -> Registration:
-    """The registration of images that were found, in pixels of their full size."""
+    """Register images, in pixels of their full size."""
     frames = with_times(images.frames, run.options.timestamps)
     sources, unread = read_inputs(frames, run.options, run.guard, skip_bad=True)
-    known = [*unread, *images.messages, *run.notes]
-    with run.executor(len(sources)) as executor, _failures_explained(run, known):
-        accepted, _ = _register_and_check(sources, known, run, executor)
+    with run.executor(len(sources)) as executor, _failures_explained(run, unread):
+        accepted, _ = _register_and_check(sources, [*unread, *images.messages], run, executor)
     return _release_images(at_full_size(accepted), run)
 
 
 @contextmanager
-def _failures_explained(run: Run, known: Sequence[Message]) -> Iterator[None]:
-    """Failures of the block name what could not be read well; of a result that is refused the report is written."""
+def _failures_explained(run: Run, unread: Sequence[Message]) -> Iterator[None]:
+    """Add unreadable and damaged images to the text of a failure in the block; write the report of a refused result."""
     try:
         yield
     except RegistrationError as error:
-        unread = [message for message in known if message.severity == "left out"]
         reasons = [str(replace(message, code="")) for message in merge_by_reason([*unread, *run.guard.warnings])]
         error.args = ("; ".join([str(error), *reasons]),)
         if isinstance(error, RefusedError):
@@ -279,36 +275,36 @@ def _failures_explained(run: Run, known: Sequence[Message]) -> Iterator[None]:
 def _register_and_check(
     sources: Sequence[Source], known: Sequence[Message], run: Run, executor: Executor
 ) -> tuple[Registration, Run]:
-    """Register and check, in pixels of the working size.
+    """Register and check, in pixels of the working size; and the run, whose reference image is now known.
 
-    Where the first image shall be the reference, but was left out, the first that is used is, and the run says so.
+    If it shall be the first image, it is the first of those used.
     """
+    if run.beside.frame == "first":
+        run = run.with_reference(sources[0])
     registration = register(sources, run, executor).with_messages(known)
     run.progress("checking", 0, 1)
     accepted = accept(registration, run)
     first = accepted.alignment.used.tolist().index(True)
     if run.beside.frame == "first" and accepted.alignment.reference != first:
-        run = replace(run, options=replace(run.options, reference=accepted.sources[first].name))
-        again = with_reference_of(registration, aligner_of(registration, run.options, run.purpose))
-        accepted = accept(again, run)
+        run = run.with_reference(accepted.sources[first])
+        accepted = accept(with_reference_of(registration, aligner_of(registration, run)), run)
     return accepted, run
 
 
-def compose_registration(chosen: CandidateLayout, run: Run, plan: OutputPlan, executor: Executor) -> StitchResult:
-    """Compose images at the places of a registration, into memory or among the outputs, with all that belongs to it."""
+def compose_registration(chosen: RegistrationLayout, run: Run, files: OutputFiles, executor: Executor) -> StitchResult:
+    """Compose the layout of a registration and stage all files that belong to the output."""
     registration, options, outputs = chosen.registration, run.options, run.outputs
-    run_blocks = blocks_on(executor, chosen.plan.placed.sources, run.guard, options.cache)
-    composed, messages = compose_images(chosen.plan, run, run_blocks)
-    stated = options if run.keeps_cache else replace(options, cache=None)
+    run_blocks = blocks_on(executor, chosen.layout.placed.sources, run.guard, run.cache)
+    composed, messages = compose_images(chosen.layout, run, run_blocks)
     result = StitchResult(
         registration=_release_images(registration, run).with_messages((*chosen.messages, *messages)),
         local_alignment=chosen.local,
-        **composed.fields | {"options": stated.for_images(len(registration.sources))},
+        **composed.fields | {"options": options.for_images(len(registration.sources))},
     )
     if options.dry_run:
         return result
     result = result.with_messages(write_page(result, outputs, partial(viewed_images, result)))
-    result = plan.stage(result)
+    result = files.stage(result)
     if run.output is not None:
         # Last: whoever finds it finds what it belongs to.
         from rdstitch.sidecar.write import sidecar  # and with it the forms of camera files, which no picture needs
@@ -318,7 +314,7 @@ def compose_registration(chosen: CandidateLayout, run: Run, plan: OutputPlan, ex
 
 
 def _release_images(registration: Registration, run: Run) -> Registration:
-    """Images kept for stages that will not come are let go; what the decoders found wrong, in any stage, is added."""
+    """Release decoded images, and add messages on damaged files."""
     for source in registration.sources:
         source.decoded_images.clear()
     return registration.with_messages(run.guard.messages)

@@ -1,4 +1,4 @@
-"""Work on images, and blocks of outputs, that workers do; and what they notice of the files meanwhile."""
+"""Running tasks on images, and blocks of outputs, on workers, and collecting their notes on the files."""
 
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -31,7 +31,7 @@ def run_on_sources(executor: Executor, tasks: Iterable[SourceTask[Result]], guar
 
 
 def _result_and_state(task: SourceTask[Result]) -> tuple[Result, GuardState]:
-    """What a worker sends back; its images, which were sent together, have one guard."""
+    """The result and the notes of a worker; images that were sent together share a guard."""
     function, sources = task
     result = function(sources)
     return result, sources[0].guard.state_of([source.path for source in sources]) if sources else ({}, {})
@@ -40,7 +40,7 @@ def _result_and_state(task: SourceTask[Result]) -> tuple[Result, GuardState]:
 def blocks_on(
     executor: Executor, sources: Sequence[Source], guard: InputGuard, folder: Path | None
 ) -> BlockRunner | None:
-    """What computes blocks of an output on workers, with strips in ``folder``; None where threads do."""
+    """The runner of blocks of an output on workers, with strips in ``folder``; None where threads do."""
     few = isinstance(executor, ProcessExecutor) and executor.workers < _COMPOSING_FROM
     if few or isinstance(executor, ThreadPoolExecutor):
         return None

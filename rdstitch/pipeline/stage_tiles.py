@@ -1,4 +1,4 @@
-"""Tiles on a stage: from files whose places are roughly known to one image, or to a table of places."""
+"""Recipe: tiles on a microscope's stage, at roughly known places, become one image or a table of places."""
 
 import os
 from collections import Counter
@@ -17,6 +17,7 @@ from rdstitch.export.places_files import fiji_list, places_table
 from rdstitch.inputs.find import FoundImages
 from rdstitch.inputs.frame import Frame, Images, frame_numbers
 from rdstitch.inputs.source import Source, read_sources
+from rdstitch.io.flat_field import FlatField
 from rdstitch.io.reduction import mean_of_channels
 from rdstitch.io.stored_tiles import StoredTile
 from rdstitch.local_alignment import no_local_alignment
@@ -26,9 +27,9 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.options.tile_options import TileOptions
 from rdstitch.pipeline.composition.flat_field import NO_FLAT_FIELD, with_flat_field
 from rdstitch.pipeline.composition.lay_out import lay_out
-from rdstitch.pipeline.output_plan import OutputPlan
+from rdstitch.pipeline.outputs.output_files import OutputFiles
 from rdstitch.pipeline.recipes import compose_registration
-from rdstitch.pipeline.run import Run
+from rdstitch.pipeline.run import RecipeInput, Run
 from rdstitch.pipeline.tiles_as_registration import tiles_as_registration
 from rdstitch.results.messages import Message, left_out
 from rdstitch.results.registration import Registration
@@ -85,27 +86,24 @@ def tiles(
         See the tree in :mod:`rdstitch.errors`.
     """
     options = with_fields(options_of(TileOptions, options), fields)
-    files = FilesBeside.of(ImageFiles, beside, "tiles")
-    run = replace(_tile_run(options, progress, output, files), inputs=as_tiles(inputs))
-    with run.open_images() as images:
-        registration, plan = _registered(images, run, options, positions_file)
+    given = _as_recipe_input(inputs, options)
+    run = Run.of(given, output, FilesBeside.of(ImageFiles, beside, "tiles"), progress)
+    with given.find_images(run.output) as images, run.outputs:
+        files = _checked_files(images, run, options, positions_file)
+        _, registration = _register(images, run, options, files, positions_file)
         with run.executor(len(registration.sources)) as executor:
-            chosen = lay_out(registration, no_local_alignment("tiles on a stage"), options.composite)
-            chosen = replace(chosen, plan=replace(chosen.plan, photographs=False))
-            return compose_registration(chosen, run, plan, executor)
+            chosen = lay_out(registration, no_local_alignment("tiles on a stage"), run.options.compositing)
+            return compose_registration(chosen, run, files, executor)
 
 
-def _tile_run(
-    options: TileOptions, progress: Progress, output: str | Path | None = None, beside: FilesBeside = NOTHING_BESIDE
-) -> Run:
-    """A run with what the stages after registration take of the options."""
+def _as_recipe_input(tiles: Images | Iterable[Any], options: TileOptions) -> RecipeInput:
+    """Tiles with what the stages after registration take of the options."""
     settings = StitchOptions(
         distortion=None if options.distortion == "auto" else options.distortion,
         composite=options.composite,
         **options.of_run,
     )
-    run = Run.of((), settings, output=output, beside=beside, progress=progress)
-    return replace(run, read=[*options.files, *settings.files])
+    return RecipeInput(as_tiles(tiles), settings, files=options.files)
 
 
 @one_native_thread()
@@ -127,25 +125,31 @@ def place_tiles(
         As for :func:`tiles`.
     """
     options = with_fields(options_of(TileOptions, options), fields)
-    run = replace(_tile_run(options, progress), inputs=as_tiles(inputs))
-    with run.open_images() as images:
-        registration, _ = _registered(images, run, options, positions_file)
-    assert registration.tiles is not None
-    return registration.tiles, registration
+    given = _as_recipe_input(inputs, options)
+    run = Run.of(given, progress=progress)
+    with given.find_images() as images, run.outputs:
+        files = _checked_files(images, run, options, positions_file)
+        return _register(images, run, options, files, positions_file)
 
 
-def _registered(
+def _checked_files(
     images: FoundImages, run: Run, options: TileOptions, positions_file: str | Path | None
-) -> tuple[Registration, OutputPlan]:
-    """The places of all tiles, once it is clear that everything can be written; their tables are, and what will be."""
+) -> OutputFiles:
     tables = [Path(file) for file in (positions_file, options.save_flat_field) if file is not None]
     names = [frame.name for frame in images.frames]
-    plan = OutputPlan.of_images(run, images.files, names, more_files=tables)
-    plan.check()
+    files = OutputFiles.of_images(run, images.files, names, more_files=tables)
+    files.check()
+    return files
+
+
+def _register(
+    images: FoundImages, run: Run, options: TileOptions, files: OutputFiles, positions_file: str | Path | None
+) -> tuple[TileRegistration, Registration]:
+    """Register all tiles, and stage the table of their places and the flat field, if wanted."""
     frames, stored, notes = tile_frames(images.frames, options.z, options.time)
     limit = options.composite.max_memory
     sources, unread = read_sources(frames, skip_bad=not options.strict, guard=run.guard, max_memory=limit)
-    plan.check_places(sources)
+    files.check_places(sources)
     sources, excluded = _of_one_kind(sources, options.strict)
     unread += excluded
     while True:
@@ -163,7 +167,7 @@ def _registered(
     tiled = replace(tiled, z=options.z, time=options.time)
     _write_beside(run.outputs, positions_file, options, sources, tiled)
     registration = tiles_as_registration(sources, tiled)
-    return registration.with_messages([*unread, *images.messages, *notes, *messages]), plan
+    return tiled, registration.with_messages([*unread, *images.messages, *notes, *messages])
 
 
 def _of_one_kind(sources: list[Source], strict: bool) -> tuple[list[Source], list[Message]]:
@@ -199,7 +203,7 @@ def _readable(sources: Sequence[Source]) -> tuple[list[Source], list[Message]]:
 def _placed(
     sources: list[Source], nominal: TileGrid, options: TileOptions, progress: Progress
 ) -> tuple[list[Source], TileRegistration, list[Message]]:
-    """The tiles with their illumination taken out, where they are, and what there is to say of that."""
+    """Correct the illumination of the tiles and find their places; with messages."""
     if len({source.camera.image_size for source in sources}) > 1:
         text = "tiles of several sizes have no flat field in common"
         illumination = [Message(text, severity="note", code="flat-field")]
@@ -219,17 +223,16 @@ def _placed(
     tiled = register_tiles(replace(plan, grid=grid), read, distortion=lens, progress=progress)
     for index in set(range(len(grid))) - set(tiled.compared.ravel().tolist()):
         read(index)
-    if options.flat_field == "auto" and sources[0].flat_field is not None and not _overlaps_show(sources, tiled):
+    field = sources[0].flat_field
+    if options.flat_field == "auto" and field is not None and not _overlaps_show(field, sources, tiled):
         sources, illumination = [replace(source, flat_field=None) for source in sources], [NO_FLAT_FIELD]
     return sources, tiled, [*illumination, *messages]
 
 
-def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
-    """Check whether overlaps are more alike with the flat field, which was found without them, than without."""
-    field = sources[0].flat_field
-    assert field is not None
+def _overlaps_show(field: FlatField, sources: Sequence[Source], tiled: TileRegistration) -> bool:
+    """Check whether the flat field, which was found without overlaps, makes these more alike."""
     raw = [replace(source, flat_field=None) for source in sources]
-    pairs = tiled.links.tiles[tiled.adjustment.weights > 0.5]
+    pairs = tiled.links.tiles[tiled.adjustment.holding]
     chosen = pairs[evenly_spaced(len(pairs), _SAMPLED_OVERLAPS)]
     places = tiled.adjustment.places
     compared = ((raw[a].read().pixels, raw[b].read().pixels, places[b] - places[a]) for a, b in chosen.tolist())
@@ -239,7 +242,7 @@ def _overlaps_show(sources: Sequence[Source], tiled: TileRegistration) -> bool:
 def _write_beside(
     outputs: Outputs, file: str | Path | None, options: TileOptions, sources: Sequence[Source], tiled: TileRegistration
 ) -> None:
-    """The table of places, and the flat field, where they are wanted."""
+    """Stage the table of places and the flat field, if wanted."""
     if options.dry_run:
         return
     if file is not None:
@@ -254,7 +257,7 @@ def _write_beside(
 
 
 def _plane(sources: Sequence[Source], channel: int | None, index: int) -> NDArray[Any]:
-    """A tile as it is registered."""
+    """Read the channel of a tile that is registered."""
     pixels = sources[index].read(keep=True).pixels
     count = 1 if pixels.ndim == 2 else pixels.shape[2]
     if channel is not None and channel >= count:
@@ -273,7 +276,7 @@ def _channels(count: int) -> str:
 def _grid(
     sources: Sequence[Source], frames: Sequence[Frame], stored: Mapping[Path, StoredTile], options: TileOptions
 ) -> TileGrid:
-    """Where the tiles should be: counted over all that were named, so that a missing tile moves no other."""
+    """The nominal grid, counted over all files named, so that a missing tile moves no other."""
     sizes = np.array([source.camera.image_size for source in sources], dtype=np.intp)
     width, height = sizes.max(axis=0).tolist()
     size, pixel_size = (width, height), options.pixel_size or sources[0].metadata.pixel_size

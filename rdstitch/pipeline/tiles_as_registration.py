@@ -1,4 +1,4 @@
-"""Places of tiles in the form that everything after registration takes."""
+"""Converting registered tiles to a :class:`Registration`, which later stages take."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -22,7 +22,7 @@ from rdstitch.stage.register_tiles import TileRegistration
 
 
 def tiles_as_registration(sources: Sequence[Source], tiled: TileRegistration) -> Registration:
-    """What was found, in the form that everything after registration takes."""
+    """Convert registered tiles to a registration."""
     fitted, links = tiled.adjustment, tiled.links
     if not tiled.linked.any():
         raise RegistrationError(
@@ -73,8 +73,8 @@ def _pair(
     fitted, links = tiled.adjustment, tiled.links
     first, second = links.tiles[number].tolist()
     of_pair = np.flatnonzero(links.pair == number)
-    agreeing = fitted.squared[of_pair] / fitted.noise < 16.0
-    errors, used = np.linalg.norm(fitted.residuals[of_pair], axis=1), bool(fitted.weights[number] > 0.25)
+    agreeing = fitted.agreeing[of_pair]
+    errors, used = np.linalg.norm(fitted.residuals[of_pair], axis=1), bool(fitted.holding[number])
     rms = math.sqrt(float((errors[agreeing] ** 2).mean())) if agreeing.any() else math.nan
     matrix = np.linalg.solve(homographies[second], homographies[first])
     relation = RadialHomography(
@@ -89,7 +89,7 @@ def _pair(
 
 
 def _messages(sources: Sequence[Source], tiled: TileRegistration) -> tuple[Message, ...]:
-    """What the user should know of the places."""
+    """Messages on the places."""
     fitted = tiled.adjustment
 
     def named(tiles: Iterable[int]) -> str:

@@ -3,13 +3,13 @@
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypedDict, Unpack, overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
-from rdstitch.choices import ChannelOrder, Framing, ImageFormat
+from rdstitch.choices import Framing, ImageFormat
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, PlacedImage, compose
 from rdstitch.compositing.canvas import refuse_scale
 from rdstitch.errors import ArgumentError, OutputError
@@ -19,8 +19,9 @@ from rdstitch.inputs.frame import Images, as_inputs, to_channel_order
 from rdstitch.inputs.input_guard import InputGuard
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.io.write import write_image
-from rdstitch.options.option import check_parameter, files_in
-from rdstitch.pipeline.given_camera import read_camera
+from rdstitch.options.option import options_of, with_fields
+from rdstitch.options.undistort_options import UndistortOptions
+from rdstitch.pipeline.inputs.camera_and_odometry import read_camera
 from rdstitch.results.messages import Message, ignored
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.output_checks import WRITABLE_SUFFIXES, check_outputs
@@ -30,36 +31,23 @@ from rdstitch.system.progress import Progress, silent
 _POINTS_PER_SIDE = 256
 
 
-class _Choices(TypedDict, total=False):
-    camera: Camera | str | Path | None
-    distortion: float | None
-    view: Framing
-    image_format: ImageFormat | None
-    overwrite: bool
-    topic: str | None
-    channel_order: ChannelOrder
-    warn: Callable[[Message], None]
-    progress: Progress
-
-
 @overload
-def undistort(inputs: Images, folder: str | Path, **choices: Unpack[_Choices]) -> list[Path]: ...
+def undistort(
+    inputs: Images, folder: str | Path, options: UndistortOptions | None = None, **more: Any
+) -> list[Path]: ...
 @overload
-def undistort(inputs: Images, folder: None = None, **choices: Unpack[_Choices]) -> list[NDArray[Any]]: ...
+def undistort(
+    inputs: Images, folder: None = None, options: UndistortOptions | None = None, **more: Any
+) -> list[NDArray[Any]]: ...
 @one_native_thread()
 def undistort(
     inputs: Images,
     folder: str | Path | None = None,
+    options: UndistortOptions | None = None,
     *,
-    camera: Camera | str | Path | None = None,
-    distortion: float | None = None,
-    view: Framing = "same",
-    image_format: ImageFormat | None = None,
-    overwrite: bool = False,
-    topic: str | None = None,
-    channel_order: ChannelOrder = "bgr",
     warn: Callable[[Message], None] = ignored,
     progress: Progress = silent,
+    **fields: Any,
 ) -> list[Path] | list[NDArray[Any]]:
     """Undistort images, each into a file of the same name in a folder, or into an array.
 
@@ -67,57 +55,45 @@ def undistort(
     ----------
     inputs : path, ndarray, or iterable of them
         Whatever :func:`rdstitch.mosaic` takes; every image must be readable, or none is written. An array becomes the
-        PNG file ``image_000i.png``, or TIFF where its
-        samples need that.
+        PNG file ``image_000i.png``, or TIFF where its samples need that.
     folder : path, optional
         Made if it does not exist. Without it, nothing is written.
-    camera : Camera or path, optional
-        The lens, or its file; adapted to the size of each image.
-    distortion : float, optional
-        λ in the half-diagonal frame, instead of a camera.
-    view : str
-        "same": size and scale at the centre stay. "all": everything that the image shows, at that scale. "valid":
-        the largest rectangle about the middle of the image, of its aspect ratio, that it covers, at that scale.
-    image_format : str, optional
-        "jpg", "png", "tif" or "webp": of all files written. Without it each has that of its input, or, where that
-        cannot be written (HEIC, raw, BMP, …), is a PNG file.
-    overwrite : bool
-    topic : str, optional
-        Of the images in ROS bags; None: the only one.
-    channel_order : str
-        Of arrays that come in or go out: "bgr" or "rgb".
+    options : UndistortOptions, optional
     warn : callable
         Called with each thing that the user should know: images not taken as input, and damaged ones.
     progress : callable
+    **fields
+        Fields of the options, instead of those in ``options``: ``undistort(images, distortion=-0.2, view="all")``.
 
     Returns
     -------
     list of Path, or of ndarray
         The files written; without a folder the images, (H, W) or (H, W, C), 0 where there is nothing to show.
     """
-    if (camera is None) == (distortion is None):
+    options = with_fields(options_of(UndistortOptions, options), fields)
+    if (options.camera is None) == (options.distortion is None):
         raise ArgumentError("give either a camera or a distortion")
-    check_parameter("view", Framing, view)
-    check_parameter("image_format", ImageFormat | None, image_format)
-    given = as_inputs(inputs, channel_order)
-    file = camera if isinstance(camera, str | Path) else None
-    lens, notes = read_camera(camera, given) if isinstance(camera, str | Path) else (camera, [])
-    guard = InputGuard()
-    with found_images(given, every=1, topic=topic) as listed, Outputs(overwrite) as outputs:
-        sources, _ = read_sources(listed.frames, camera=lens, distortion=distortion, skip_bad=False, guard=guard)
+    given, guard, files, images = as_inputs(inputs, options.channel_order), InputGuard(), list[Path](), []
+    camera, notes = (None, []) if options.camera is None else read_camera(options.camera, given)
+    with (
+        found_images(given, every=1, topic=options.topic) as listed,
+        Outputs(options.overwrite) as outputs,
+    ):
+        sources, _ = read_sources(
+            listed.frames, camera=camera, distortion=options.distortion, skip_bad=False, guard=guard
+        )
         for message in (*notes, *listed.messages):
             warn(message)
-        files, images = [], []
         if folder is not None:
-            files = _files(sources, Path(folder), image_format)
+            files = _files(sources, Path(folder), options.image_format)
             outputs.make_folder(Path(folder))
-            check_outputs(files, overwrite, [*listed.files, *files_in(file)])
+            check_outputs(files, options.overwrite, [*listed.files, *options.files])
         for index, source in enumerate(sources):
-            image = _undistorted(source, view)
+            image = _undistorted(source, options.view)
             if folder is None:
-                images.append(to_channel_order(image.pixels, channel_order))
+                images.append(to_channel_order(image.pixels, options.channel_order))
             else:
-                metadata = source.metadata if view == "same" else source.metadata.in_another_size()
+                metadata = source.metadata if options.view == "same" else source.metadata.in_another_size()
                 write_image(files[index], image.pixels, image.alpha, metadata=metadata, outputs=outputs)
             progress("undistorting", index + 1, len(sources))
     for message in guard.messages:
@@ -132,7 +108,7 @@ def _undistorted(source: Source, view: Framing) -> Composite:
 
 
 def _files(sources: Sequence[Source], folder: Path, image_format: ImageFormat | None) -> list[Path]:
-    """The files to write, of different names."""
+    """The files to write; two of one name are refused."""
     files = [folder / _output_name(source, image_format) for source in sources]
     twice = [path for path, count in Counter(files).items() if count > 1]
     if twice:
@@ -149,7 +125,7 @@ def _output_name(source: Source, image_format: ImageFormat | None) -> str:
 
 
 def _fits_png(source: Source) -> bool:
-    """Whether PNG holds its samples; of the files that cannot be written in their own format, it holds all."""
+    """Whether PNG holds the samples; it holds those of all files that cannot be written in their own format."""
     if source.frame is None or source.frame.image is None:
         return True
     pixels = source.frame.decoded().pixels
@@ -157,7 +133,7 @@ def _fits_png(source: Source) -> bool:
 
 
 def undistorted_canvas(camera: Camera, view: Framing) -> Canvas:
-    """Where the undistorted image lies in the output, at the scale that it has at its distortion centre."""
+    """The canvas of an undistorted image, at its scale at the distortion centre."""
     outline = camera.undistort(camera.outline(_POINTS_PER_SIDE))
     if view == "same":
         low, high = np.full(2, -0.5), np.array(camera.image_size) - 0.5

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rdstitch.arrays import FloatArray, IntArray
+from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.numerics.robust_loss import RAYLEIGH_MEDIAN
 from rdstitch.stage.equations import LinkedPoints, StageEquations, StageState, Variances
 from rdstitch.stage.grid import TileGrid
@@ -25,7 +25,7 @@ _AGREEING_WEIGHT = 0.1  # of a block from which on the noise is also by it
 _MIN_NOISE = 0.1  # of the variances that blocks have by their information
 _SAMPLES = 16  # draws from the posterior, to estimate the variances of the stage
 _RESULT_SAMPLES = 64  # draws in the result, so that every ± that is made of them is itself known to 9 %
-HOLDING_WEIGHT = 0.25  # of a block, or a pair, from which on it holds its tiles
+_HOLDING_WEIGHT = 0.25  # of a block, or a pair, from which on it holds its tiles
 _TAILS = 4.0  # degrees of freedom of the places about the stage's model: a few tiles may be far off
 _MIN_LINES = 4  # rows or columns whose errors show what rows or columns are off
 
@@ -56,6 +56,16 @@ class Adjustment:
     stage: StageModel
     off_stage: FloatArray  # (N, 2): what each tile is off against the model of the stage
     deviations: FloatArray  # (S, N, 2): draws of the errors of the places, pixels
+
+    @property
+    def holding(self) -> BoolArray:
+        """Which pairs hold their tiles where they are (P,); the others contradict them."""
+        return self.weights > _HOLDING_WEIGHT
+
+    @property
+    def agreeing(self) -> BoolArray:
+        """Which blocks are where the places put them, as far as their noise goes (M,)."""
+        return self.squared / self.noise < _WIDTH**2
 
     def between(self, pair: IntArray) -> tuple[FloatArray, FloatArray]:
         """Place of the second tile of a pair in the first (2,), and its covariance (2, 2)."""
@@ -128,7 +138,7 @@ def _variances(
     equations: StageEquations, state: StageState, draws: StageState, weights: FloatArray, usual: Variances
 ) -> Variances:
     """Variances of tiles, rows, columns and pairs by those that links hold: the fewer, the more ``usual`` counts."""
-    agreeing = weights > HOLDING_WEIGHT
+    agreeing = weights > _HOLDING_WEIGHT
 
     def squared(values: FloatArray, errors: FloatArray, chosen: IntArray) -> FloatArray:
         """Expected squares of some of the vectors (K, 2), of which ``errors`` (S, K, 2) are draws."""

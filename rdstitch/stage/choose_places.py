@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rdstitch.arrays import FloatArray, IntArray
-from rdstitch.stage.adjustment import HOLDING_WEIGHT, Adjustment, adjust
+from rdstitch.stage.adjustment import Adjustment, adjust
 from rdstitch.stage.equations import LinkedPoints
 from rdstitch.stage.evidence import ANYWHERE, HUNDRED_TO_ONE
 from rdstitch.stage.pair_candidates import Candidates, SearchPlan
@@ -27,7 +27,7 @@ def choose_places(
     fitted = adjust(plan.grid, LinkedPoints.of(pairs, {}), plan.stage_std, lens)
     for count in range(_ROUNDS):
         before = dict(chosen)
-        doubted = {number for number, weight in zip(chosen, fitted.weights, strict=True) if weight < HOLDING_WEIGHT}
+        doubted = {number for number, holds in zip(chosen, fitted.holding, strict=True) if not holds}
         for number, of_pair in enumerate(candidates):
             if not len(of_pair.nats) or (number in chosen and number not in doubted):
                 continue

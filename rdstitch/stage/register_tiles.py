@@ -11,7 +11,7 @@ from rdstitch.arrays import BoolArray, FloatArray, IntArray
 from rdstitch.errors import ArgumentError
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.match_graph import connected_components
-from rdstitch.stage.adjustment import HOLDING_WEIGHT, Adjustment, adjust
+from rdstitch.stage.adjustment import Adjustment, adjust
 from rdstitch.stage.choose_places import choose_places
 from rdstitch.stage.equations import LinkedPoints
 from rdstitch.stage.grid import TileGrid
@@ -104,7 +104,7 @@ def register_tiles(
         progress("refining", count + 1, len(chosen))
     links = LinkedPoints.of(pairs, matches)
     fitted = _with_lens(plan, links, lens, distortion)
-    held = links.tiles[fitted.weights > HOLDING_WEIGHT]
+    held = links.tiles[fitted.holding]
     groups = connected_components(len(plan.grid), *held.T)
     together = tuple(tuple(group) for group in groups if len(group) > 1)
     return TileRegistration(plan, fitted, links, pairs, together)

@@ -38,7 +38,7 @@ def test_twelve_bits_in_sixteen_are_as_bright_as_eight(frames: list[Path], tmp_p
     assert (found.dark, found.burnt) == (("dark.png",), ("burnt.png",))
 
 
-def test_faults_are_found(frames: list[Path], stranger: Path, tmp_path: Path) -> None:
+def test_faults_are_found(frames: list[Path], stranger: Path, tmp_path: Path, rdstitch: Run) -> None:
     copied(frames, tmp_path)
     copied([stranger], tmp_path, "stranger.png")
     sharp = cv2.imread(str(frames[1]))
@@ -58,12 +58,12 @@ def test_faults_are_found(frames: list[Path], stranger: Path, tmp_path: Path) ->
     assert found.dark == ("dark.png",)
     assert "stranger.png" in found.alone
     assert not {frame.name for frame in frames} & set(found.alone)
-    text = found.as_text()
+    text = rdstitch("doctor", tmp_path).out
     assert "broken.jpg" in text
     assert "leave blurred images out" in text
 
 
-def test_zooms_and_cameras_are_told_apart(frames: list[Path], tmp_path: Path) -> None:
+def test_zooms_and_cameras_are_told_apart(frames: list[Path], tmp_path: Path, rdstitch: Run) -> None:
     for number, (frame, focal, model) in enumerate(zip(frames, (24, 24, 50), ("A", "A", "B"), strict=True)):
         exif = Image.Exif()
         exif[ExifTags.Base.Model] = model
@@ -72,19 +72,21 @@ def test_zooms_and_cameras_are_told_apart(frames: list[Path], tmp_path: Path) ->
             image.save(tmp_path / f"{number}.jpg", exif=exif, quality=95)
     found = examine(tmp_path)
     assert found.cameras == (("A", 2), ("B", 1))
-    assert "by EXIF in 3 of 3" in found.focal
-    assert any("2 cameras" in item for item in found.advice)
-    assert any("zoomed" in item for item in found.advice)
+    assert (len(found.focal_px), found.zoomed) == (3, True)
+    text = rdstitch("doctor", tmp_path).out
+    assert "by EXIF in 3 of 3" in text
+    assert "advice:     the images come from 2 cameras" in text
+    assert "advice:     the lens was zoomed" in text
     with Image.open(frames[2]) as image:
         image.save(tmp_path / "2.jpg", quality=95)
-    assert not any("cameras" in item for item in examine(tmp_path).advice)  # one says nothing of its camera
+    assert "the images come from" not in rdstitch("doctor", tmp_path).out  # one says nothing of its camera
 
 
 def test_images_that_have_nothing_in_common(frames: list[Path], stranger: Path, rdstitch: Run) -> None:
     found = examine([frames[0], stranger])
     assert found.overlap is None
     assert (found.plan, found.alone) == (None, (frames[0].name, stranger.name))
-    assert "overlap" in found.advice[0]
+    assert "overlap" in found.problems[0].text
     rdstitch("doctor", "no_such_file.jpg", status=3)
 
 
@@ -92,8 +94,11 @@ def test_images_that_have_nothing_in_common(frames: list[Path], stranger: Path, 
 def test_arrays(frames: list[Path], single: bool) -> None:
     images = [np.asarray(Image.open(frame)) for frame in frames]
     found = examine(images[0] if single else images, channel_order="rgb")
-    assert found.images == (1 if single else 3)
-    assert ("needs two images" in " ".join(found.advice)) == single
+    assert (found.images, found.plan is None) == ((1, True) if single else (3, False))
+
+
+def test_one_image_is_too_few(frames: list[Path], rdstitch: Run) -> None:
+    assert "needs two images" in rdstitch("doctor", frames[0]).out
 
 
 def test_what_cannot_be_laid_out_is_an_advice(frames: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,4 +107,4 @@ def test_what_cannot_be_laid_out_is_an_advice(frames: list[Path], monkeypatch: p
 
     monkeypatch.setattr(doctor, "mosaic", too_large)
     found = doctor.examine(frames)
-    assert (found.plan, found.advice) == (None, ("the horizon is in the image",))
+    assert (found.plan, [problem.text for problem in found.problems]) == (None, ["the horizon is in the image"])

@@ -20,6 +20,7 @@ from rdstitch.io.read import read_image
 from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.follow import follow
+from rdstitch.tracking.preview import LivePreview
 from tests.cli.running import DISTORTION, FAST, Run, copied, flight, rows_of, start
 from tests.sampled import sampled
 
@@ -162,7 +163,7 @@ def test_the_line_of_what_cannot_be_read(rdstitch: Run, drive: list[Path], folde
 def test_a_preview_that_cannot_be_written_ends_nothing(drive: list[Path], tmp_path: Path) -> None:
     arrivals = open_frame_stream(drive[0].parent, frames_folder=Path, idle=0.5)
     options, gone = StitchOptions(workers=1, distortion=DISTORTION), tmp_path / "gone" / "preview.jpg"
-    poses = list(follow(arrivals, options, preview=gone, refresh=0.0))
+    poses = list(follow(arrivals, options, preview=LivePreview(gone, 0.0)))
     assert len({pose.name for pose in poses}) == len(drive)
     assert [message.text[:14] for pose in poses for message in pose.messages] == ["no preview any"]
 

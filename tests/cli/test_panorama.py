@@ -15,8 +15,8 @@ from examples.worlds.turns import TurningSequence, camera_rotations, panorama_ro
 from rdstitch.features import FeatureOptions
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.pipeline.outputs.viewer_pages import viewed_images
 from rdstitch.pipeline.recipes import pano
-from rdstitch.pipeline.viewer_pages import viewed_images
 from rdstitch.report.pairs import match_graph
 from rdstitch.synthetic.rendering import Photometry
 from rdstitch.viewer.page import viewer_page

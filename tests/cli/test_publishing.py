@@ -177,7 +177,7 @@ def test_an_image_of_the_folder_is_never_replaced(rdstitch: Run, located: Path, 
     ("made_by", "name"),
     [
         ("rdstitch.report.page.report_page", "report.html"),
-        ("rdstitch.pipeline.viewer_pages.viewer_page", "field.html"),
+        ("rdstitch.pipeline.outputs.viewer_pages.viewer_page", "field.html"),
         ("rdstitch.camera_files.camera_file_text", "camera.json"),
         ("rdstitch.georeferencing.georeference.Georeference.world_file_texts", "field.jgw"),
     ],
@@ -206,7 +206,7 @@ def test_an_earlier_page_is_older(
 ) -> None:
     arguments = ("mosaic", located / "flight", "-o", tmp_path / "field.dzi", *FAST, "--overwrite")
     rdstitch(*arguments)
-    monkeypatch.setattr("rdstitch.pipeline.viewer_pages.viewer_page", lambda *_: 1 // 0)
+    monkeypatch.setattr("rdstitch.pipeline.outputs.viewer_pages.viewer_page", lambda *_: 1 // 0)
     assert "the file of this name is older" in rdstitch(*arguments).err
 
 

@@ -1,14 +1,22 @@
 """``rdstitch doctor``: what will happen, before a long run."""
 
-from typing import Annotated
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated, Any
 
 import click
 
 from rdstitch.options.option import Option
 from rdstitch.options.shared_options import Every, Topic
+from rdstitch.results.messages import bytes_in_words, seconds_in_words, shortened
 from rdstitch_cli.flags import Inputs, command
 from rdstitch_cli.stitching import resolve
 from rdstitch_cli.terminal import Reporter
+
+if TYPE_CHECKING:
+    from rdstitch.pipeline.doctor import Examination
+
+_MIN_OVERLAP = 0.3  # of neighbours, below which more images are advised
 
 
 @command(
@@ -34,9 +42,83 @@ def doctor(
     from rdstitch.pipeline.doctor import examine
     from rdstitch.system.outputs import json_bytes
 
-    examination = examine(resolve(inputs), every=every, topic=topic, progress=reporter)
+    found = examine(resolve(inputs), every=every, topic=topic, progress=reporter)
     reporter.finish()
-    if as_json:
-        click.echo(json_bytes(examination.as_dict()), nl=False)
-    else:
-        click.echo(examination.as_text(), nl=False)
+    click.echo(json_bytes(_record(found)) if as_json else _text(found), nl=False)
+
+
+def _record(found: "Examination") -> dict[str, Any]:
+    """What was found, for JSON."""
+    record = {name: value for name, value in asdict(found).items() if name not in ("focal_px", "zoomed", "problems")}
+    words = {"sizes": _sizes(found), "cameras": _cameras(found), "focal": _focal(found), "advice": _advice(found)}
+    order = "images unreadable sizes cameras focal blurred dark burnt alone overlap plan advice"
+    return {name: (record | words)[name] for name in order.split()}
+
+
+def _text(found: "Examination") -> str:
+    """What was found, one line for each thing, advice at the end."""
+
+    def few(names: Sequence[str], what: str, none: str) -> str:
+        return f"{len(names)} {what}: {shortened(names)}" if names else none
+
+    overlap = "none found" if found.overlap is None else f"about {found.overlap:.0%} with the best partner"
+    effort = "no mosaic is to be expected"
+    if (plan := found.plan) is not None:
+        effort = "{} x {} pixels; about {} of memory and {} to composite them".format(
+            *plan.canvas_size, bytes_in_words(plan.memory_bytes), seconds_in_words(plan.seconds)
+        )
+    lines = [
+        ("images", f"{found.images}" + (f", and {len(found.unreadable)} unreadable" if found.unreadable else "")),
+        ("sizes", "; ".join(f"{size} ({count})" for size, count in _sizes(found))),
+        ("cameras", "; ".join(f"{camera} ({count})" for camera, count in _cameras(found))),
+        ("focal", _focal(found)),
+        ("sharpness", few(found.blurred, "blurred", "nothing blurred")),
+        (
+            "exposure",
+            f"{few(found.dark, 'dark', 'nothing dark')}; {few(found.burnt, 'burnt out', 'nothing burnt out')}",
+        ),
+        ("overlap", f"{overlap}; {few(found.alone, 'without a place', 'every image has a place')}"),
+        ("mosaic", effort),
+        *(("advice", item) for item in _advice(found) or ["none: go ahead"]),
+    ]
+    return "".join(f"{name + ':':<12}{text}\n" for name, text in lines)
+
+
+def _sizes(found: "Examination") -> list[tuple[str, int]]:
+    return [("{} x {}".format(*size), count) for size, count in found.sizes]
+
+
+def _cameras(found: "Examination") -> list[tuple[str, int]]:
+    return [(camera or "unknown", count) for camera, count in found.cameras]
+
+
+def _focal(found: "Examination") -> str:
+    if not found.focal_px:
+        return "not known from EXIF; it is guessed, which matters for trajectory only"
+    text = f"{min(found.focal_px):.0f}" + (f" to {max(found.focal_px):.0f}" if found.zoomed else "")
+    return f"{text} pixels by EXIF in {len(found.focal_px)} of {found.images} images"
+
+
+def _advice(found: "Examination") -> list[str]:
+    """What to change, most important first; empty where nothing is amiss."""
+    known, unreadable = [camera for camera, _ in found.cameras if camera], found.unreadable
+    advice = (
+        (found.images < 2, "stitching needs two images or more; name another one"),
+        (len(known) > 1, f"the images come from {len(known)} cameras: stitch those of each on their own"),
+        (found.zoomed, "the lens was zoomed between the images: stitch those of one zoom on their own"),
+        (unreadable, f"{len(unreadable)} file{'s' * (len(unreadable) != 1)} cannot be read: {''.join(unreadable[:1])}"),
+        *((True, str(problem)) for problem in found.problems),
+        (
+            found.overlap is not None and found.overlap < _MIN_OVERLAP,
+            f"images overlap by about {found.overlap or 0.0:.0%} only: take more images, a third is the least",
+        ),
+        (
+            found.blurred,
+            f"leave blurred images out if their neighbours overlap without them: {shortened(found.blurred)}",
+        ),
+        (
+            found.dark or found.burnt,
+            "dark or burnt-out images have few features: fix the exposure if you can take them again",
+        ),
+    )
+    return [text for applies, text in advice if applies]

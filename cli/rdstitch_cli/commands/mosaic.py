@@ -1,17 +1,16 @@
 """``rdstitch mosaic``: a folder of frames becomes one rectified image."""
 
-from collections.abc import Sequence
-from contextlib import ExitStack
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import click
 
+from rdstitch.errors import ArgumentError
 from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.option import Option, Range
 from rdstitch.options.shared_options import Every
 from rdstitch.results.messages import shortened
 from rdstitch_cli.flags import ImageFile, Inputs, PrintSidecar, command, flags_of
-from rdstitch_cli.following import Following, Idle, followed, print_result
+from rdstitch_cli.following import Following, Idle, print_followed, print_result, source_to_follow
 from rdstitch_cli.stitching import (
     STITCHING,
     Preview,
@@ -22,9 +21,6 @@ from rdstitch_cli.stitching import (
     stitch_options,
 )
 from rdstitch_cli.terminal import Reporter
-
-if TYPE_CHECKING:
-    from rdstitch.inputs.frame import Named
 
 
 @command(
@@ -90,9 +86,9 @@ def mosaic(
     options = stitch_options(given, preview=preview)
     how: dict[str, Any] = {"every": every, "progress": reporter, "beside": beside}
     if bands is not None:
-        from rdstitch.pipeline.bands import mosaic_bands, parse_bands  # with all that reads an earlier result
+        from rdstitch.pipeline.bands import mosaic_bands  # with all that reads an earlier result
 
-        first, others = mosaic_bands(resolve(inputs), output, parse_bands(bands), options, **how)
+        first, others = mosaic_bands(resolve(inputs), output, _parse_bands(bands), options, **how)
         report_result(first, reporter, as_json=as_json)
         for other in others:
             report_applied(other, reporter)
@@ -102,24 +98,30 @@ def mosaic(
         for block in mosaic_blocks(resolve(inputs), output, options, **how):
             names = shortened(block.registration.used_names)
             report_result(block, reporter, as_json=as_json, more=f" ({names})")
-    else:
-        from rdstitch.pipeline.output_plan import OutputPlan
+    elif following:
+        from rdstitch.pipeline.live_source import follow_for_mosaic
         from rdstitch.pipeline.recipes import mosaic as recipe
-        from rdstitch.pipeline.run import Run
 
-        with ExitStack() as stack:
-            paths: Sequence[Named]
-            if following:
-                file = output.with_suffix(".preview.jpg") if refresh else None
-                run = Run.of(inputs, options, output=output, beside=beside, every=every)
-                plan = OutputPlan.of_images(run, inputs, more_files=[] if file is None else [file])
-                options, live = run.options, followed(plan, reporter, idle=idle, preview=file, refresh=refresh)
-                paths = stack.enter_context(live)
+        source = source_to_follow(inputs, every, idle)
+        with follow_for_mosaic(source, output, options, beside, refresh=refresh) as frames:
+            print_followed(frames, reporter)
+            result = recipe(frames.images, output, frames.given.options, **how)
+            if as_json:
+                report_result(result, reporter, as_json=True)
             else:
-                paths = resolve(inputs)
-            result = recipe(paths, output, options, **how)
-            if following and not as_json:
                 print_result(result.registration, reporter, output)
                 reporter.made(result.summary)
-            else:
-                report_result(result, reporter, as_json=as_json)
+    else:
+        from rdstitch.pipeline.recipes import mosaic as recipe
+
+        report_result(recipe(resolve(inputs), output, options, **how), reporter, as_json=as_json)
+
+
+def _parse_bands(text: str) -> dict[str, str]:
+    """Patterns of images by the names of bands, of ``NIR=*_NIR.TIF,RED=*_RED.TIF``."""
+    pairs = [part.partition("=") for part in text.split(",")]
+    bands = {name.strip(): pattern.strip() for name, _, pattern in pairs}
+    complete = len(bands) == len(pairs) > 1 and all(bands) and all(bands.values())
+    if not complete or {"/", "\\"} & set("".join(bands)):
+        raise ArgumentError(f"--bands: {text!r} is not a list like NIR=*_NIR.TIF,RED=*_RED.TIF")
+    return bands

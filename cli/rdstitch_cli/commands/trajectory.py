@@ -1,22 +1,17 @@
 """``rdstitch trajectory``: the path of the camera over the plane."""
 
-from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
-from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
+from rdstitch.choices import TrajectoryFormat, TrajectoryFrame
 from rdstitch.options.feature_options import FeatureOptions
 from rdstitch.options.option import FileUse, Option
 from rdstitch.options.shared_options import Every, Height
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch_cli.flags import Inputs, command, flags_of
-from rdstitch_cli.following import Following, Idle, followed, print_result
+from rdstitch_cli.following import Following, Idle, print_followed, print_result, source_to_follow
 from rdstitch_cli.stitching import report_registration, resolve, stitch_options
 from rdstitch_cli.terminal import Reporter
-
-if TYPE_CHECKING:
-    from rdstitch.inputs.frame import Named
 
 
 @command(
@@ -64,34 +59,20 @@ def trajectory(
     poses are printed as frames arrive.
     """
     from rdstitch.export.trajectory_files import frame_of
-    from rdstitch.pipeline.output_plan import OutputPlan
     from rdstitch.pipeline.recipes import trajectory as recipe
-    from rdstitch.pipeline.run import Run
-    from rdstitch.results.pose import FollowedPoses
 
     options = stitch_options(given)
-    with ExitStack() as stack:
-        paths: Sequence[Named]
-        if following:
-            run = Run.of(inputs, options, Purpose.TRAJECTORY, every=every)
-            plan, options = OutputPlan.of_path(run, inputs, output, plot, file_format), run.options
-            poses = FollowedPoses(height, frame or frame_of(file_format))
-            paths = stack.enter_context(followed(plan, reporter, idle=idle, poses=poses))
-        else:
-            paths = resolve(inputs)
-        _, registration = recipe(
-            paths,
-            output,
-            options,
-            layout=file_format,
-            plot=plot,
-            height=height,
-            frame=frame,
-            every=every,
-            progress=reporter,
-        )
-        if following:
+    how: dict[str, Any] = {"file_format": file_format, "plot": plot, "height": height, "frame": frame, "every": every}
+    if following:
+        from rdstitch.pipeline.live_source import follow_for_trajectory
+        from rdstitch.results.pose import FollowedPoses
+
+        source, poses = source_to_follow(inputs, every, idle), FollowedPoses(height, frame or frame_of(file_format))
+        with follow_for_trajectory(source, output, options, poses, plot=plot, file_format=file_format) as frames:
+            print_followed(frames, reporter)
+            _, registration = recipe(frames.images, output, frames.given.options, progress=reporter, **how)
             print_result(registration, reporter, output)
-        else:
-            report_registration(registration, reporter)
-        reporter.made(f"{output}: {registration.summary}, lengths ± {registration.alignment.length_std:.2%}")
+    else:
+        _, registration = recipe(resolve(inputs), output, options, progress=reporter, **how)
+        report_registration(registration, reporter)
+    reporter.made(f"{output}: {registration.summary}, lengths ± {registration.alignment.length_std:.2%}")

@@ -18,6 +18,7 @@ import numpy as np
 from rdstitch.alignment.frames.reference_frame import frontal_reference, in_frame_of
 from rdstitch.alignment.motion_models import MODELS
 from rdstitch.alignment.result import Alignment
+from rdstitch.alignment.whole_pixels import on_whole_pixels
 from rdstitch.arrays import FloatArray, evenly_spaced
 from rdstitch.choices import ModelName, Purpose
 from rdstitch.compositing.seam_quality import DIAGONAL
@@ -28,6 +29,7 @@ from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.composition.lay_out import (
     IMAGE_GRID,
     CandidateLayout,
+    RegistrationLayout,
     align_registration_locally,
     is_stretched,
     lay_out,
@@ -35,7 +37,6 @@ from rdstitch.pipeline.composition.lay_out import (
 )
 from rdstitch.pipeline.registration.aligner import Aligner
 from rdstitch.pipeline.registration.realign import by_second_motions, plane_of_most, realigned
-from rdstitch.pipeline.registration.whole_pixels import on_whole_pixels
 from rdstitch.pipeline.registration.working_size import at_full_size
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
@@ -57,32 +58,34 @@ _BY_CHANCE = Message(
 
 @dataclass(frozen=True, eq=False)
 class _Trials:
-    """Lays out registrations of the same images as the output would have them, with exposure and seams."""
+    """Lays out registrations of the same images as the output would have them."""
 
     options: StitchOptions
     pano: bool
     edges_of: Callable[[int], FloatArray]  # straight edges in an image
 
-    def lay_out(self, registration: Registration, local: LocalAlignment | None = None) -> CandidateLayout:
+    def lay_out(self, registration: Registration, local: LocalAlignment | None = None) -> RegistrationLayout:
         """Lay out a registration in pixels of the working size."""
         options = self.options
-        whole = on_whole_pixels(_with_frontal_reference(at_full_size(registration), options, always=self.pano))
+        whole = _with_frontal_reference(at_full_size(registration), options, always=self.pano)
+        whole = replace(whole, alignment=on_whole_pixels(whole.alignment, whole.pairs))
         if local is None:
             local = align_registration_locally(whole, options.local_alignment, self.edges_of, options.threads)
-        laid_out = lay_out(whole, local, options.composite)
-        if options.dry_run:
-            return laid_out
-        return replace(laid_out, plan=laid_out.plan.decided(options.compositing))
+        return lay_out(whole, local, options.compositing)
+
+    def judge(self, registration: Registration, local: LocalAlignment | None = None) -> CandidateLayout:
+        """The same, with exposure and seams."""
+        return self.lay_out(registration, local).judged()
 
     def attempt(self, registration: Registration) -> CandidateLayout | None:
         """Lay out an alternative registration; None where it has no canvas, or none that the options can turn."""
         with suppress(LimitError, ArgumentError):
-            return self.lay_out(registration)
+            return self.judge(registration)
         return None
 
 
-def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner) -> CandidateLayout:
-    """The layout whose seams hold, or break the least; of a panorama always in the frame of an image.
+def choose_layout(registration: Registration, options: StitchOptions, aligner: Aligner) -> RegistrationLayout:
+    """Choose the layout whose seams hold, or break least; that of a panorama is in the frame of an image.
 
     Pixels are those of the working size.
     """
@@ -92,7 +95,7 @@ def choose_layout(registration: Registration, options: StitchOptions, aligner: A
         return trials.lay_out(registration)
     first, too_large = None, None
     try:
-        first = trials.lay_out(registration)
+        first = trials.judge(registration)
     except LimitError as error:
         too_large = error
     if first is None or first.seams.mostly_unlike:
@@ -129,7 +132,7 @@ def _with_frontal_reference(registration: Registration, options: StitchOptions, 
 def _plane_behind(
     registration: Registration, first: CandidateLayout | None, trials: _Trials, aligner: Aligner
 ) -> tuple[Registration, CandidateLayout | None]:
-    """The plane behind what moves of its own, with its layout, where its images look more alike; else what is given."""
+    """The plane behind moving objects, with its layout, if its images look more alike; else what is given."""
     plane = plane_of_most(registration, aligner, trials.options.threads)
     if plane is None or not _joins(plane, registration, aligner.threshold):
         return registration, first
@@ -143,12 +146,12 @@ def _plane_behind(
 def _alternatives(
     registration: Registration, first: CandidateLayout | None, trials: _Trials, aligner: Aligner
 ) -> Iterator[CandidateLayout]:
-    """Other layouts, the likeliest first, where something speaks against the first one, or it has no canvas."""
+    """Alternative layouts, likeliest first, if the first has faults or no canvas."""
     if first is not None:
         if not first.faults:
             return
         if first.local.fields and trials.options.local_alignment == "auto":
-            yield trials.lay_out(registration, no_local_alignment("seams hold better without it"))
+            yield trials.judge(registration, no_local_alignment("seams hold better without it"))
         if first.local.by_heights:
             return  # parallax that the places of the cameras explain is not that of another model
         if (other_surface := _other_surface(registration, first, trials, aligner)) is not None:
@@ -161,7 +164,7 @@ def _alternatives(
 def _other_surface(
     registration: Registration, first: CandidateLayout, trials: _Trials, aligner: Aligner
 ) -> CandidateLayout | None:
-    """By the second motion of the images whose seams break; None where no more of them looks alike then."""
+    """The layout by the second motion of the images whose seams break; None if they do not look more alike."""
     used = np.flatnonzero(registration.alignment.used).tolist()
     broken = [(used[one.images[0]], used[one.images[1]]) for one in first.seams.misfits]
     other = by_second_motions(registration, broken, aligner)
@@ -175,7 +178,7 @@ def _other_surface(
 
 
 def _least_broken(tried: Sequence[CandidateLayout], *, keep_first: bool) -> CandidateLayout:
-    """The layout that the least speaks against; or else the first, unless another is clearly better."""
+    """The layout with the fewest faults; or the first, unless another is clearly better."""
     first = tried[0]
     best = min((one for one in tried if one.clipped <= first.clipped), key=lambda one: (one.faults, one.broken))
     broken = 0 if first.seams.seams_fit else first.broken
@@ -186,13 +189,13 @@ def _least_broken(tried: Sequence[CandidateLayout], *, keep_first: bool) -> Cand
 def _other_models(
     registration: Registration, first: CandidateLayout | None, options: StitchOptions, aligner: Aligner
 ) -> Iterator[Registration]:
-    """The same images aligned by other models, where every one finds its place."""
+    """The images aligned by other motion models, if each still finds its place."""
     alignment = registration.alignment
     # What breaks along seams may have moved, and proves nothing against a layout that fits; one that is stretched does.
-    stretched = first is None or is_stretched(first.plan)
+    stretched = first is None or is_stretched(first.layout)
     allowed = max(options.threshold * stretched, _MISFIT * _error(registration))
     names = [name for name in _MODELS if name != alignment.model] if options.model == "auto" else []
-    if first is not None and first.plan.placed.has_place:  # a map needs a plane with a metric
+    if first is not None and first.layout.placed.has_place:  # a map needs a plane with a metric
         names = [name for name in names if MODELS[name].has_metric_poses]
     for name in names:
         by_name = replace(aligner, options=replace(aligner.options, model=name))
@@ -203,8 +206,9 @@ def _other_models(
 
 
 def _joins(other: Registration, first: Registration, allowed: float) -> bool:
-    """Whether another registration uses all images of one, with errors that are allowed: local alignment makes seams
-    hold that nothing else does.
+    """Whether another registration uses all images of the first, with errors up to ``allowed``, pixels.
+
+    Without this limit local alignment would make the seams of any registration hold.
     """
     return bool((other.alignment.used >= first.alignment.used).all()) and _error(other) <= allowed
 
@@ -224,7 +228,7 @@ def _error(registration: Registration) -> float:
 
 
 def _differs(registration: Registration, allowed: float, other: Alignment, *, stretched: bool) -> bool:
-    """Whether another alignment can have other seams: it joins the images, and puts them elsewhere on each other."""
+    """Whether another alignment can change the seams: it joins the images and moves their overlaps."""
     alignment = registration.alignment
     if not _joins(replace(registration, alignment=other), registration, allowed):
         return False

@@ -1,4 +1,4 @@
-"""The last stage of every image: from registered images to pixels, in memory or in a file with a page beside it."""
+"""The last stage of every recipe: registered images become pixels, in memory or in a file."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,12 +10,9 @@ import numpy as np
 
 from rdstitch.compositing import (
     Canvas,
-    Composite,
     CompositeOptions,
     Decisions,
-    FileComposite,
     PlacedImage,
-    SeamQuality,
     compose_decided,
     compose_to_file,
     decide,
@@ -24,13 +21,14 @@ from rdstitch.compositing import (
 from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.tiles import BlockRunner
 from rdstitch.georeferencing.georeference import Georeference, world_file_paths
+from rdstitch.georeferencing.place_on_map import MapPlacement
 from rdstitch.inputs.source import Source
 from rdstitch.io.formats import check_memory, check_size
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
 from rdstitch.options.upright_options import Corners
-from rdstitch.pipeline.composition.map_canvas import place_on_canvas, plan_on_map
-from rdstitch.pipeline.output_messages import (
+from rdstitch.pipeline.composition.map_canvas import canvas_on_map, place_on_canvas
+from rdstitch.pipeline.composition.output_messages import (
     cut_away_messages,
     differing_profile_messages,
     lost_profile_messages,
@@ -47,105 +45,112 @@ from rdstitch.system.process_memory import return_freed_memory
 
 
 @dataclass(frozen=True)
-class CanvasPlan:
-    """Images on a canvas, and what was decided on small versions of them."""
+class CanvasLayout:
+    """Images on the canvas of the output."""
 
     placed: PlacedImages
     canvas: Canvas
     images: Sequence[PlacedImage]
-    georeference: Georeference | None
-    not_georeferenced: str  # why
-    decisions: Decisions | None = None
-    photographs: bool = True  # whether seams are to be judged as a person sees them
+    placement: MapPlacement
+    options: CompositeOptions
 
     @classmethod
     def of(cls, placed: PlacedImages, options: CompositeOptions) -> Self:
-        """Plan the canvas."""
-        canvas, place, reason = plan_on_map(placed, options)
+        """Lay the images out."""
+        canvas, placement = canvas_on_map(placed, options)
         if options.rectangle is not None:
             canvas = replace(canvas, cropped_to=_box_of_rectangle(placed, options.rectangle, canvas))
-        return cls(placed, canvas, placed.images(canvas), place, reason)
+        return cls(placed, canvas, placed.images(canvas), placement, options)
 
-    def decided(self, options: CompositeOptions) -> Self:
-        """The plan with exposure, seams and crop of its images, decided on small versions of them."""
-        return replace(self, decisions=decide(self.images, self.canvas, options))
+    def decide(self) -> Decisions:
+        """Decide on exposure, seams and crop of the images, on small versions of them."""
+        return decide(self.images, self.canvas, self.options)
 
-    @property
-    def seams(self) -> SeamQuality:
-        """What its seams are like."""
-        return SeamQuality() if self.decisions is None else self.decisions.quality
+    def decided(self) -> "DecidedLayout":
+        """The same with what was decided, which is not decided again."""
+        return DecidedLayout(self.placed, self.canvas, self.images, self.placement, self.options, self.decide())
+
+    def place_of(self, final: Canvas) -> Georeference | None:
+        """The place of the final canvas on the Earth."""
+        place, grid = self.placement.place, self.placed.grid
+        # Without rounding, where the pixels are those of an earlier output.
+        return grid.place if place is not None and grid is not None else place_on_canvas(place, self.canvas, final)
+
+
+@dataclass(frozen=True)
+class DecidedLayout(CanvasLayout):
+    """Images on the canvas of the output, for which exposure, seams and crop were decided."""
+
+    decisions: Decisions
+
+    def decide(self) -> Decisions:
+        """What was decided."""
+        return self.decisions
 
 
 def compose_images(
-    plan: CanvasPlan, run: Run, run_blocks: BlockRunner | None = None
+    layout: CanvasLayout, run: Run, run_blocks: BlockRunner | None = None
 ) -> tuple[OutputImage, list[Message]]:
-    """Put images on a canvas, in memory or into a file that can hold it, of a dry run plan it; and what to know of it.
+    """Compose images on their canvas, in memory or into a file, or plan that in a dry run; with messages.
 
     A file has colour profile and EXIF of the first image, and its place on the Earth. ``run_blocks``: see
     :func:`rdstitch.compositing.compose_decided`.
     """
     return_freed_memory()
-    options, outputs = run.options.compositing, run.outputs
-    placed, canvas, place, output = plan.placed, plan.canvas, plan.georeference, run.output
-    messages = [
-        *masked_messages(placed),
-        *place_messages(place, plan.not_georeferenced, placed),
-        *cut_away_messages(placed, canvas, options),
-    ]
+    options, output = layout.options, run.output
+    placed, canvas, placement = layout.placed, layout.canvas, layout.placement
+    messages = masked_messages(placed) + place_messages(placement, placed) + cut_away_messages(placed, canvas, options)
     # A crop may yet make it fit.
     if output is not None and options.crop == "none":
         check_size(output, canvas.size)
         check_memory(output, canvas.size, options.max_memory)
-    composed = OutputImage(
+    laid_out = OutputImage(
         placed=placed,
         canvas=canvas,
         options=run.options,
-        output=None if output is None else Path(output),
-        georeference=place,
-        not_georeferenced=plan.not_georeferenced,
+        output=output,
+        georeference=placement.place,
+        not_georeferenced=placement.reason,
     )
     if run.options.dry_run:
-        return replace(composed, plan=planned(plan.images, canvas, options)), messages
-    plan = plan if plan.decisions is not None else plan.decided(options)
-    assert plan.decisions is not None
-    if plan.photographs:
-        messages += seam_messages(plan.seams, [str(source.path) for source in placed.sources])
+        return replace(laid_out, plan=planned(layout.images, canvas, options)), messages
+    decisions = layout.decide()
+    if not placed.tiles:  # seams are judged as seen in a photograph
+        messages += seam_messages(decisions.quality, [str(source.path) for source in placed.sources])
+    composed, of_output = _drawn(replace(laid_out, seams=decisions.quality), layout, decisions, run, run_blocks)
+    return composed, [*messages, *of_output]
+
+
+def _drawn(
+    laid_out: OutputImage, layout: CanvasLayout, decisions: Decisions, run: Run, run_blocks: BlockRunner | None
+) -> tuple[OutputImage, list[Message]]:
+    """Draw the image, in memory or into a file with its world files."""
+    outputs, output, sources = run.outputs, run.output, layout.placed.sources
 
     def report(fraction: float) -> None:
         run.progress("compositing", round(100 * fraction), 100)
 
-    def place_of(final: Canvas) -> Georeference | None:
-        # Without rounding, where the pixels are those of an earlier output.
-        return place_on_canvas(place, canvas, final) if place is None or placed.grid is None else placed.grid.place
-
     def tags(final: Canvas) -> list[ExtraTag]:
-        on_final = place_of(final)
-        return [] if on_final is None else on_final.tiff_tags()
+        place = layout.place_of(final)
+        return [] if place is None else place.tiff_tags()
 
-    made: Composite | FileComposite
     if output is None:
-        made = composite = compose_decided(plan.decisions, report, run_blocks)
-        composed = replace(composed, composite=composite)
-    else:
-        metadata = _metadata(placed.sources[0], options)
-        made = written = compose_to_file(
-            output, plan.decisions, report, run_blocks, metadata=metadata, extra_tags=tags, outputs=outputs
-        )
-        composed = replace(composed, written=written)
-    place = place_of(made.canvas)
-    messages += made.messages
-    if output is not None:
-        messages += [
-            *lost_profile_messages(placed.sources[0], Path(output)),
-            *differing_profile_messages(placed.sources),
-        ]
-        if place is not None and (files := world_file_paths(output)):
-            messages += outputs.attempt(files[0], partial(_write_world_files, outputs, files, place))
-    return replace(composed, canvas=made.canvas, georeference=place, seams=plan.seams), messages
+        image = compose_decided(decisions, report, run_blocks)
+        place = layout.place_of(image.canvas)
+        return replace(laid_out, composite=image, canvas=image.canvas, georeference=place), [*image.messages]
+    metadata = _metadata(sources[0], layout.options)
+    written = compose_to_file(
+        output, decisions, report, run_blocks, metadata=metadata, extra_tags=tags, outputs=outputs
+    )
+    place = layout.place_of(written.canvas)
+    messages = [*written.messages, *lost_profile_messages(sources[0], output), *differing_profile_messages(sources)]
+    if place is not None and (files := world_file_paths(output)):
+        messages += outputs.attempt(files[0], partial(_write_world_files, outputs, files, place))
+    return replace(laid_out, written=written, canvas=written.canvas, georeference=place), messages
 
 
 def _metadata(source: Source, options: CompositeOptions) -> Metadata:
-    """That of the output, as of its first image; its pixels have another size where they were scaled."""
+    """Metadata of the output: that of the first image, with the pixel size as scaled."""
     metadata = source.metadata.of_composite()
     if metadata.pixel_size is None:
         return metadata
@@ -153,7 +158,7 @@ def _metadata(source: Source, options: CompositeOptions) -> Metadata:
 
 
 def _box_of_rectangle(placed: PlacedImages, corners: Corners, canvas: Canvas) -> Box | None:
-    """Where the rectangle that the user has named lies on the canvas; None where its corners have no place there."""
+    """Box of the user's rectangle on the canvas; None if its corners lie outside."""
     index = placed.reference
     if index is None:
         return None

@@ -26,7 +26,7 @@ def check_one_size(sources: Sequence[Source]) -> None:
 
 
 def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list[Source], list[Message]]:
-    """The tiles, which are read without the illumination that all have; and what there is to say of that."""
+    """The images, to be read with flat-field correction; and messages on it."""
     from rdstitch.stage.estimate_flat_field import FlatFieldUnknown, estimate_illumination  # for tiles only
 
     if wanted == "off":

@@ -1,4 +1,4 @@
-"""Stages: images of a registration, aligned locally, on the canvas of the output; and what speaks against it."""
+"""Stages: local alignment, and the layout of a registration on the canvas of the output, with its faults."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -16,7 +16,7 @@ from rdstitch.inputs.source import Source
 from rdstitch.local_alignment import LocalAlignment, PutativeMatches, align_locally, no_local_alignment
 from rdstitch.matching.two_view import PairRegistration
 from rdstitch.options.composite_options import CompositeOptions
-from rdstitch.pipeline.composition.compose import CanvasPlan
+from rdstitch.pipeline.composition.compose import CanvasLayout, DecidedLayout
 from rdstitch.pipeline.composition.straighten import oriented
 from rdstitch.results.messages import Message
 from rdstitch.results.placed_images import PlacedImages
@@ -28,36 +28,45 @@ IMAGE_GRID = np.stack(np.meshgrid(*[[0.02, 0.25, 0.5, 0.75, 0.98]] * 2), axis=-1
 
 
 @dataclass(frozen=True)
-class CandidateLayout:
+class RegistrationLayout:
     """A registration in the frame of the output, with its images on a canvas."""
 
     registration: Registration
     local: LocalAlignment
-    plan: CanvasPlan
+    layout: CanvasLayout
     messages: tuple[Message, ...] = ()
+
+    def judged(self) -> "CandidateLayout":
+        """The same with seams, by which layouts are compared."""
+        return CandidateLayout(self.registration, self.local, self.layout.decided(), self.messages)
+
+
+@dataclass(frozen=True)
+class CandidateLayout(RegistrationLayout):
+    """A layout that may be chosen, by its seams."""
+
+    layout: DecidedLayout
 
     @property
     def seams(self) -> SeamQuality:
         """What its seams are like."""
-        return self.plan.seams
+        return self.layout.decisions.quality
 
     @cached_property
     def faults(self) -> int:
-        """What speaks against it: seams that do not fit, stretched places, overlaps that do not look alike, and local
-        alignment whose seams lie nowhere where they could be judged, 0 to 4.
-        """
+        """Number of faults, 0 to 4: misfitting seams, stretching, unlike overlaps, unjudged local alignment."""
         seams = self.seams
         unjudged = bool(self.local.fields) and not len(seams.places)
-        return int(not seams.seams_fit) + int(is_stretched(self.plan)) + int(seams.mostly_unlike) + int(unjudged)
+        return int(not seams.seams_fit) + int(is_stretched(self.layout)) + int(seams.mostly_unlike) + int(unjudged)
 
     @property
     def clipped(self) -> int:
         """Number of images of which only the near part is drawn."""
-        return sum(part is not None for part in self.plan.canvas.near)
+        return sum(part is not None for part in self.layout.canvas.near)
 
     @property
     def broken(self) -> int:
-        """Number of places at which its seams do not fit; they are as far apart in every layout."""
+        """Number of places at which its seams do not fit; places are equally spaced in every layout."""
         return int(self.seams.misfit.sum())
 
 
@@ -72,7 +81,7 @@ def align_registration_locally(
     edges: Callable[[int], FloatArray] | None = None,
     threads: int = 1,
 ) -> LocalAlignment:
-    """Displacement fields of the images that are used, in their order, from the matches of all their pairs.
+    """Estimate displacement fields of the images used, in their order, from the matches of all pairs.
 
     ``edges`` are those of an image that fields should not bend.
     """
@@ -103,22 +112,22 @@ def align_registration_locally(
     )
 
 
-def lay_out(registration: Registration, local: LocalAlignment, options: CompositeOptions) -> CandidateLayout:
-    """Images of a registration on the canvas of the output."""
+def lay_out(registration: Registration, local: LocalAlignment, options: CompositeOptions) -> RegistrationLayout:
+    """Lay the images of a registration out on the canvas of the output."""
     placed, messages = oriented(PlacedImages.of(registration, local.fields or None), options)
     if placed.orientation is not None:
         homographies = placed.orientation @ registration.alignment.homographies
         registration = replace(registration, alignment=replace(registration.alignment, homographies=homographies))
-    return CandidateLayout(registration, local, CanvasPlan.of(placed, options), tuple(messages))
+    return RegistrationLayout(registration, local, CanvasLayout.of(placed, options), tuple(messages))
 
 
-def is_stretched(plan: CanvasPlan) -> bool:
-    """Whether a plane shows some places much larger than most, or much longer than wide, lens apart."""
-    canvas = plan.canvas
+def is_stretched(layout: CanvasLayout) -> bool:
+    """Whether a plane magnifies some places much more than most, or stretches them in one direction, lens aside."""
+    canvas = layout.canvas
     if canvas.projection != PLANE:
         return False
     magnification = []
-    for image in plan.images:
+    for image in layout.images:
         size = np.array(image.camera.image_size)
         at, step = IMAGE_GRID * size, 1e-3 * size[1]
         # A fisheye's border is stretched on any plane.

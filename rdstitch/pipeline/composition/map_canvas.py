@@ -1,4 +1,4 @@
-"""The canvas of images; of georeferenced ones north up, and of the ground sample distance that was requested."""
+"""The canvas of the output; north up, with the requested ground sample distance, if it is georeferenced."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,7 +14,7 @@ from rdstitch.errors import ArgumentError
 from rdstitch.geometry.crs import Crs
 from rdstitch.georeferencing.georeference import Georeference
 from rdstitch.georeferencing.map_grid import MapGrid, grid_of_extent, read_grid
-from rdstitch.georeferencing.place_on_map import MIN_POSITIONS, has_place, place_on_map
+from rdstitch.georeferencing.place_on_map import MIN_POSITIONS, MapPlacement, has_place, place_on_map
 from rdstitch.inputs.source import Source
 from rdstitch.results.placed_images import PlacedImages, SavedGrid
 
@@ -22,7 +22,7 @@ _SAME_PIXELS = 1e-6  # pixels that two grids may be off: rounding
 
 
 def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:
-    """Find out before long work whether what is requested of the map can be had."""
+    """Refuse early what the options request of a map without a known place."""
     if options.epsg is not None:
         Crs(options.epsg)
     if options.like is not None:
@@ -38,20 +38,20 @@ def check_map(sources: Sequence[Source], options: CompositeOptions) -> None:
             )
 
 
-def plan(placed: PlacedImages, options: CompositeOptions) -> Canvas:
+def output_canvas(placed: PlacedImages, options: CompositeOptions) -> Canvas:
     """The canvas of the images, no larger than ``options.max_size``."""
-    canvas = _plan(placed, options, options.scale)
+    canvas = _canvas(placed, options, options.scale)
     if placed.grid is not None:
         return _on_saved_grid(canvas, placed, placed.grid, cropped=options.crop == "auto")
     if options.max_size is None or max(canvas.size) <= options.max_size:
         return canvas
     # The canvas has whole pixels around the images, and a full turn a multiple of some: these may be too many.
     spare = 1 if canvas.period is None else max(32, options.max_size // 128)
-    return _plan(placed, options, options.scale * max(options.max_size - spare, 1) / max(canvas.size))
+    return _canvas(placed, options, options.scale * max(options.max_size - spare, 1) / max(canvas.size))
 
 
-def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canvas:
-    """The canvas on a plane, or, of images taken by turning on the spot, in a projection."""
+def _canvas(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canvas:
+    """The canvas on a plane or, for a pure rotation, in a projection."""
     if not placed.turned and options.projection not in ("auto", "plane"):
         raise ArgumentError(
             f"the {options.projection} projection is for images taken by turning on the spot; these were not, "
@@ -70,18 +70,20 @@ def _plan(placed: PlacedImages, options: CompositeOptions, scale: float) -> Canv
     return replace(canvas, orientation=placed.orientation)
 
 
-def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas, Georeference | None, str]:
-    """The canvas with its place on the Earth, and why it has none, or what contradicts it."""
-    canvas = plan(placed, options)
-    place, reason = _place(placed, canvas, options)
-    if place is None:
+def canvas_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas, MapPlacement]:
+    """The canvas, and its place on the Earth."""
+    canvas = output_canvas(placed, options)
+    found = _placement(placed, canvas, options)
+    if (place := found.place) is None:
         for name in ("gsd", "like", "extent"):
             if getattr(options, name) is not None:
-                raise ArgumentError(f"{name} needs a georeferenced output: {reason or 'that is off'}; leave it out")
-        return canvas, None, reason
+                reason = found.reason or "that is off"
+                raise ArgumentError(f"{name} needs a georeferenced output: {reason}; leave it out")
+        return canvas, found
     if placed.grid is not None:
         saved = placed.grid.place
-        return canvas, saved and saved.after(canvas.matrix @ np.linalg.inv(placed.grid.from_plane)), reason
+        on_canvas = saved and saved.after(canvas.matrix @ np.linalg.inv(placed.grid.from_plane))
+        return canvas, replace(found, place=on_canvas)
     if (grid := _grid(options, place)) is not None:
         on_grid = grid.place.in_pixels(place) @ canvas.matrix
         laid = _on_grid(canvas, placed, on_grid, grid.size)
@@ -89,7 +91,7 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
             raise ArgumentError(f"none of the images lies within {options.like or 'the extent'}")
         # As in the file, without rounding.
         exact = replace(place.after(grid.place.in_pixels(place)), scale=grid.place.scale, origin=grid.place.origin)
-        return laid, exact, reason
+        return laid, replace(found, place=exact)
     rotate, scale = options.rotate, options.scale
     if options.north_up and not rotate and not options.upright:
         rotate = place.clockwise_deg
@@ -97,22 +99,22 @@ def plan_on_map(placed: PlacedImages, options: CompositeOptions) -> tuple[Canvas
         scale *= place.gsd / options.gsd
     laid = canvas
     if (rotate, scale) != (options.rotate, options.scale):
-        laid = plan(placed, replace(options, rotate=rotate, scale=scale, gsd=None))
-    return laid, place_on_canvas(place, canvas, laid), reason
+        laid = output_canvas(placed, replace(options, rotate=rotate, scale=scale, gsd=None))
+    return laid, replace(found, place=place_on_canvas(place, canvas, laid))
 
 
-def _place(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> tuple[Georeference | None, str]:
-    """The place of a canvas on the Earth, and why it has none, or what contradicts it."""
+def _placement(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> MapPlacement:
+    """The place of a canvas on the Earth."""
     if options.georeference == "off":
-        return None, ""
+        return MapPlacement(None)
     if placed.turned:
-        return None, "the camera turned on the spot"
+        return MapPlacement(None, "the camera turned on the spot")
     epsg = options.epsg if options.like is None else read_grid(options.like).place.crs.epsg
     if placed.place is None:
         to_output = canvas.matrix @ placed.homographies
         return place_on_map(placed.sources, to_output, placed.errors, epsg, force=options.georeference == "force")
     place = placed.place.after(canvas.matrix)
-    return place if epsg is None else place.in_system(Crs(epsg), np.concatenate(canvas.footprints)), ""
+    return MapPlacement(place if epsg is None else place.in_system(Crs(epsg), np.concatenate(canvas.footprints)))
 
 
 def _grid(options: CompositeOptions, place: Georeference) -> MapGrid | None:
@@ -126,7 +128,7 @@ def _grid(options: CompositeOptions, place: Georeference) -> MapGrid | None:
 
 
 def _on_saved_grid(canvas: Canvas, placed: PlacedImages, grid: SavedGrid, *, cropped: bool) -> Canvas:
-    """The canvas of which a crop leaves the pixels of an earlier output; these alone, where it does not hold them."""
+    """The canvas cropped to the pixels of an earlier output; exactly these pixels if it does not cover them."""
     to_grid = grid.from_plane @ np.linalg.inv(canvas.matrix)
     left, top = np.rint(-to_grid[:2, 2]).astype(int).tolist()
     shift = np.array([[1.0, 0.0, -left], [0.0, 1.0, -top], [0.0, 0.0, 1.0]])

@@ -1,4 +1,4 @@
-"""Stage: check a registration; what fails a check is left out by name, and the rest is aligned anew."""
+"""Stage: check a registration; images that fail are left out by name, and the rest is aligned again."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -38,18 +38,15 @@ class _Checked:
         return any(finding.kind.scope is Scope.WHOLE for finding in self.failures)
 
     def with_messages(self) -> Registration:
-        """The registration with what was found of it in words."""
+        """The registration with its findings as messages."""
         return self.registration.with_messages(messages_of(self.findings, self.registration))
 
 
 @impossible_estimates_fail()
 def accept(registration: Registration, run: Run) -> Registration:
-    """The registration of what passes all checks, with everything that the user should know of it.
-
-    The registration comes and goes in pixels of the working size.
-    """
+    """The registration of the images that pass all checks, with messages, in pixels of the working size."""
     options, purpose = run.options, run.purpose
-    aligner = aligner_of(registration, options, purpose)
+    aligner = aligner_of(registration, run)
     undamaged = None if options.force else _without_damage(registration, aligner, run.guard)
     if undamaged is not None and _is_simpler(undamaged.alignment.model, registration.alignment.model):
         registration, undamaged = undamaged, None
@@ -80,7 +77,7 @@ def _repairs(
     aligner: Aligner,
     threads: int,
 ) -> Iterator[_Checked]:
-    """What may pass where ``first`` fails: without damaged files, the plane of most images, without what fails."""
+    """Repairs of a failing registration: without damaged files, by the plane of most images, without what fails."""
     if undamaged is not None and not (checked := check(undamaged)).failures:
         yield checked
     start = first
@@ -100,7 +97,7 @@ def _repairs(
 
 
 def _without_damage(registration: Registration, aligner: Aligner, guard: InputGuard) -> Registration | None:
-    """Without images of damaged files; None where none is used, or too few others are left.
+    """The registration without damaged files; None if none is used, or too few others are left.
 
     Flipped bits shift a part of an image: by a few pixels, that looks as if the camera had tilted, and all tilt then;
     by more, as if something moved.
@@ -121,7 +118,7 @@ def _is_simpler(model: ModelName, former: ModelName) -> bool:
 
 
 def _worst(checked: _Checked) -> Rejected:
-    """The worst images, no two of them linked, since a bad image spoils its neighbours; else the failing pairs."""
+    """The worst failing images, no two of them linked, since a bad image spoils its neighbours; else failing pairs."""
     registration, failures = checked.registration, checked.failures
     single = {finding.images[0]: finding for finding in failures if finding.kind.scope is Scope.IMAGE}
     if not single:

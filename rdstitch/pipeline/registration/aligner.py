@@ -1,28 +1,23 @@
-"""Stages: registered pairs become one alignment, which finds more pairs, which make a better alignment."""
+"""Stage: the alignment of all images by their registered pairs, as a draft and complete."""
 
-import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Self, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, most_matches_read
+from rdstitch.alignment.distinct_pairs import DistinctPairs, links_of_copies
 from rdstitch.alignment.frames.cut_outs import common_size, cut_alignment, framed_camera, framed_link
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.alignment.known_model import KnownModel
-from rdstitch.alignment.near_copies import without_measurements
-from rdstitch.alignment.result import LinkFit, Unused
-from rdstitch.arrays import FloatArray
 from rdstitch.choices import Purpose
 from rdstitch.errors import ImpossibleCameraError, RegistrationError
 from rdstitch.geometry.camera import Camera
 from rdstitch.inputs.source import Source
-from rdstitch.matching.copies import SAME_PX, copies_of, near_copies_of, without_copies
 from rdstitch.matching.rough_ground import over_rough_ground
-from rdstitch.matching.two_view import Pair, PairRegistration
+from rdstitch.matching.two_view import PairRegistration
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.registration.alignment_inputs import alignment_options, sightings
 from rdstitch.pipeline.registration.working_size import at_working_size
@@ -36,14 +31,11 @@ Computed = TypeVar("Computed")
 # Share of the matches off the planes of their pairs that are where the alignment expects them: more than half, and it
 # was the lens that moved them, not the ground.
 _EXPLAINED = 0.5
-# Times the errors of its image, and of its pairs on their own, that a near copy is off by where it needs a motion that
-# the others do not: 20 to 60 of rendered ones that are tilted or zoomed, 1.0 of those that are only shifted.
-_MISFIT = 1.5
 
 
 @contextmanager
 def impossible_estimates_fail() -> Iterator[None]:
-    """An estimated camera that cannot be is a failed registration; a block, or a decorator of a stage."""
+    """Turn errors of an impossible estimate into a RegistrationError; as a block, or decorator of a stage."""
     try:
         yield
     except np.linalg.LinAlgError as error:
@@ -58,33 +50,29 @@ def impossible_estimates_fail() -> Iterator[None]:
 
 
 @dataclass(frozen=True)
+class TaskOfPairs:
+    """An alignment task, with the pairs that its evidence was chosen from."""
+
+    pairs: Sequence[PairRegistration]
+    distinct: DistinctPairs
+    task: AlignmentTask
+
+
+@dataclass(frozen=True)
 class AlignedPairs:
     """Pairs, and the alignment that was made from them."""
 
     pairs: tuple[PairRegistration, ...]  # every pair that was compared, in the order of the images
     alignment: Alignment
-    rough: bool = False  # whether the inliers that it was made from are those over rough ground
-    completed: Callable[[], Alignment] | None = None  # what the alignment is a draft of; None where it is complete
-    known: KnownModel | None = None  # what a draft by more pairs can start from
+    rough: bool  # whether the inliers that it was made from are those over rough ground
 
 
 @dataclass(frozen=True)
-class _DistinctPairs:
-    """Registered pairs of images where each that is there twice counts once."""
+class DraftedPairs(AlignedPairs):
+    """Pairs, and a draft of their alignment, by a few matches of each."""
 
-    registered: Mapping[Pair, PairRegistration]  # by the images that they are between, copies replaced
-    copies: Mapping[int, int]  # of each copy, the image that it is a copy of
-    near_copies: Mapping[int, int]  # of each that is placed afterwards, the image that shows almost the same
-
-    @property
-    def evidence(self) -> list[Pair]:
-        """The pairs that the images are aligned by."""
-        return [ends for ends in self.registered if not self.near_copies.keys() & {*ends}]
-
-    @property
-    def of_near_copies(self) -> list[Pair]:
-        """The pairs that near copies are placed by."""
-        return [ends for ends in self.registered if self.near_copies.keys() & {*ends}]
+    task: TaskOfPairs  # what it is a draft of
+    known: KnownModel | None  # what a draft by more pairs can start from
 
 
 @dataclass(frozen=True)
@@ -103,7 +91,7 @@ class Aligner:
     def of(
         cls, sources: Sequence[Source], options: StitchOptions, cache: Cache, purpose: Purpose = Purpose.MOSAIC
     ) -> Self:
-        """From what the user decided, and what the images and their headers say; see :class:`AlignmentOptions`."""
+        """From options, images and their headers; see :class:`AlignmentOptions`."""
         paths = tuple(str(source.path) for source in sources)
         megapixels = options.features.for_images(len(sources)).limits[1]
         cameras = tuple(at_working_size(source.camera.with_guessed_focal(), megapixels) for source in sources)
@@ -120,10 +108,10 @@ class Aligner:
         return [(psi, theta) for psi, theta in self.quarters.tilts(np.array(tilts)).tolist()]
 
     def align(self, pairs: Sequence[PairRegistration]) -> AlignedPairs:
-        """Align the images by the pairs that were registered; from an earlier run where the cache has it."""
+        """Align the images by their registered pairs."""
         return self.completed(self.draft(pairs))
 
-    def draft(self, pairs: Sequence[PairRegistration], known: KnownModel | None = None) -> AlignedPairs:
+    def draft(self, pairs: Sequence[PairRegistration], known: KnownModel | None = None) -> DraftedPairs:
         """Model, lens and poses by a few matches of each pair: what shows which pairs and matches are missing.
 
         The model is that of fewer pairs, if it is ``known`` and the others agree with it.
@@ -137,11 +125,11 @@ class Aligner:
                 aligned = replace(over, pairs=tuple(pairs), rough=True)
         return self.metric(aligned) if self.needs_poses else aligned
 
-    def completed(self, aligned: AlignedPairs) -> AlignedPairs:
-        """The images adjusted to all matches, where their alignment is a draft."""
-        if aligned.completed is None:
-            return aligned
-        return replace(aligned, alignment=aligned.completed(), completed=None)
+    def completed(self, draft: DraftedPairs) -> AlignedPairs:
+        """The images adjusted to all matches."""
+        task = draft.task.task
+        alignment = self._of_all_images(self._recalled("alignment", task, lambda: task.result), draft.task)
+        return AlignedPairs(draft.pairs, alignment, draft.rough)
 
     def used(self, aligned: AlignedPairs) -> Sequence[PairRegistration]:
         """The pairs with the inliers that the alignment was made from."""
@@ -150,8 +138,9 @@ class Aligner:
     def _explains(
         self, alignment: Alignment, pairs: Sequence[PairRegistration], ground: Sequence[PairRegistration]
     ) -> bool:
-        """Whether most matches off the planes of their pairs are where an alignment without them expects them: it knows
-        more of the lens than a pair does; and near a camera that turns is no ground.
+        """Whether an alignment predicts most matches that rough ground would add: then it was the lens, not the ground.
+
+        A camera that turns on the spot has no ground near it.
         """
         errors = [np.zeros(0)]
         for pair, more in zip(pairs, ground, strict=True):
@@ -163,47 +152,38 @@ class Aligner:
 
     def _drafted(
         self, pairs: Sequence[PairRegistration], known: KnownModel | None = None, counted: frozenset[int] = frozenset()
-    ) -> AlignedPairs:
-        """The images aligned; near copies are placed afterwards, but for those that are ``counted`` as all are."""
+    ) -> DraftedPairs:
+        """Draft the alignment; near copies are placed afterwards, except those ``counted`` as evidence."""
         if not any(pair.relation for pair in pairs):
             raise RegistrationError(_no_overlap(self.paths, pairs))
-        distinct = self._distinct(pairs, counted)
-        task = replace(self._task(distinct), known=known)
-        compared = [distinct.registered[ends].images for ends in distinct.evidence]
-
-        def complete(alignment: Alignment) -> Alignment:
-            alignment = self._upright(alignment, task)
-            alignment = alignment.with_copies(distinct.copies, compared)
-            alignment = replace(alignment, links=(*alignment.links, *self._links_of_copies(alignment, pairs)))
-            twice = {*distinct.copies, *distinct.near_copies}
-            return alignment.with_messages([self._counted_once(twice)] if twice else [])
-
+        distinct = DistinctPairs.of(pairs, self.options, self.quarters, counted)
+        task = self._task(distinct, known)
+        of_pairs = TaskOfPairs(pairs, distinct, task)
         drafted, draft_model = self._recalled("draft", task, lambda: (task.draft, task.draft_model))
-        draft = complete(drafted)
-        if misfits := self._misfits(draft, distinct):
+        draft = self._of_all_images(drafted, of_pairs)
+        if misfits := distinct.misfits(draft):
             with_them = self._drafted(pairs, counted=counted | misfits)
             if with_them.alignment.model != draft.model:  # so little new ground tells of motion, but not of the lens
                 return with_them
+        return DraftedPairs(tuple(pairs), draft, rough=False, task=of_pairs, known=draft_model)
 
-        def completed() -> Alignment:
-            return complete(self._recalled("alignment", task, lambda: task.result))
+    def _of_all_images(self, alignment: Alignment, of_pairs: TaskOfPairs) -> Alignment:
+        """The alignment of a task as that of all upright images, copies included."""
+        distinct = of_pairs.distinct
+        alignment = self._upright(alignment, of_pairs.task)
+        compared = [distinct.registered[ends].images for ends in distinct.evidence]
+        alignment = alignment.with_copies(distinct.copies, compared)
+        others = links_of_copies(alignment, of_pairs.pairs, self.threshold)
+        alignment = replace(alignment, links=(*alignment.links, *others))
+        twice = sorted({*distinct.copies, *distinct.near_copies})
+        if not twice:
+            return alignment
+        names = shortened(names_of(self.paths[k] for k in twice))
+        text = f"counted once, because they show almost only what other images show: {names}"
+        return alignment.with_messages([Message(text, severity="detail", code="copies")])
 
-        return AlignedPairs(tuple(pairs), draft, completed=completed, known=draft_model)
-
-    def _distinct(self, pairs: Sequence[PairRegistration], counted: frozenset[int]) -> _DistinctPairs:
-        """Which pairs are evidence; where all images show the same, all are."""
-        copies = copies_of(pairs)
-        registered = without_copies(pairs, copies)
-        if not registered:
-            copies = {}
-            registered = without_copies(pairs, copies)
-        near = without_measurements(near_copies_of(registered), self._options_without(copies))
-        near = {copy: first for copy, first in near.items() if copy not in counted}
-        distinct = _DistinctPairs(registered, copies, near)
-        return distinct if distinct.evidence else replace(distinct, near_copies={})
-
-    def _task(self, distinct: _DistinctPairs) -> AlignmentTask:
-        """What is aligned: images as they are stored, cut ones in a frame that holds each of them."""
+    def _task(self, distinct: DistinctPairs, known: KnownModel | None) -> AlignmentTask:
+        """The task of aligning images as they are stored; images cut to several sizes in a common frame."""
         stored, count = self.quarters.back, len(distinct.evidence)
         cameras = tuple(stored.camera(camera, k) for k, camera in enumerate(self.cameras))
         most = most_matches_read(count, self.options)
@@ -215,92 +195,26 @@ class Aligner:
         if (size := common_size(cameras, links)) is not None:
             cameras = tuple(framed_camera(camera, size) for camera in cameras)
             links = tuple(framed_link(link, size) for link in links)
-        options = self._options_without(distinct.copies)
-        return AlignmentTask(cameras, links[:count], options, distinct.near_copies, links[count:])
-
-    def _misfits(self, alignment: Alignment, distinct: _DistinctPairs) -> frozenset[int]:
-        """The near copies that a model fits worse than their images, and than their pairs fit on their own."""
-        errors: dict[int, list[FloatArray]] = {}
-        near = distinct.near_copies
-        concerned = near.keys() | {*near.values()}
-        for ends, pair in distinct.registered.items():
-            copies = near.keys() & {*ends}
-            if concerned & {*ends} and len(copies) < 2 and alignment.used[[*ends]].all():
-                both = np.array([pair.errors(alignment.transfer), pair.pairwise_errors])[:, pair.relation.inliers]
-                for image in copies or ends:
-                    errors.setdefault(image, []).append(both)
-        medians = dict.fromkeys(concerned, np.zeros(2))
-        medians |= {image: np.median(np.concatenate(parts, axis=1), axis=1) for image, parts in errors.items()}
-        return frozenset(
-            copy
-            for copy, first in near.items()
-            if medians[copy][0] > max(_MISFIT * medians[first][0], _MISFIT * medians[copy][1], SAME_PX)
-        )
-
-    def _options_without(self, copies: Mapping[int, int]) -> AlignmentOptions:
-        """The options without copies: what is given of one is given of the image that it is a copy of."""
-        given, quarters = self.options, self.quarters
-        control = []
-        for one in given.control:
-            first = copies.get(one.image, one.image)
-            x, y = quarters.back.point(quarters.point(np.array(one.offset), one.image), first).tolist()
-            control.append(replace(one, image=first, offset=(x, y)))
-        upright = None if given.gravity is None else _filled(quarters.directions(given.gravity), copies)
-        known = None
-        if given.positions is not None:  # a place and its accuracy go together
-            std = np.full(len(self.cameras), math.nan) if given.positions_std is None else given.positions_std
-            known = _filled(np.column_stack([given.positions, std]), copies)
-        return replace(
-            given,
-            reference=None if given.reference is None else copies.get(given.reference, given.reference),
-            control=tuple(control),
-            positions=None if known is None else known[:, :2],
-            positions_std=None if known is None else known[:, 2],
-            gravity=None if upright is None else quarters.back.directions(upright),
-        )
-
-    def _links_of_copies(self, alignment: Alignment, pairs: Sequence[PairRegistration]) -> Iterator[LinkFit]:
-        """How well the registered pairs agree that are no evidence."""
-        known = {fit.images for fit in alignment.links}
-        for pair in pairs:
-            if pair.relation and pair.images not in known:
-                errors = pair.errors(alignment.transfer)[pair.relation.inliers]
-                agreeing = errors[errors < max(self.threshold, SAME_PX)]
-                rms = float(np.sqrt(np.mean(agreeing**2))) if len(agreeing) else math.nan
-                yield LinkFit(*pair.images, len(errors), len(agreeing), rms, Unused.COPY)
-
-    def _counted_once(self, twice: Iterable[int]) -> Message:
-        names = shortened(names_of(self.paths[k] for k in sorted(twice)))
-        text = f"counted once, because they show almost only what other images show: {names}"
-        return Message(text, severity="detail", code="copies")
+        return AlignmentTask(cameras, links[:count], distinct.options, distinct.near_copies, links[count:], known)
 
     def _recalled(self, stage: str, task: AlignmentTask, compute: Callable[[], Computed]) -> Computed:
-        """What comes of a task; from an earlier run where the cache has it."""
+        """A result of a task, from the cache if it is there."""
         of_links = (task.links, task.links_of_copies, sorted(task.near_copies.items()))
         inputs = (task.cameras, self.cache.digest(of_links), task.options, task.known)
         return self.cache.recall(stage, inputs, compute)
 
     def _upright(self, alignment: Alignment, task: AlignmentTask) -> Alignment:
-        """An alignment of the images as they are stored as one of the upright images, each of its own size."""
+        """Convert an alignment of stored images to one of upright images, each of its own size."""
         sizes = [self.quarters.back.camera(camera, k).image_size for k, camera in enumerate(self.cameras)]
         if any(camera.image_size != size for camera, size in zip(alignment.cameras, sizes, strict=True)):
             alignment = cut_alignment(alignment, sizes)
         return self.quarters.alignment(alignment, task.options.gravity, task.near_copies)
 
-    def metric(self, aligned: AlignedPairs) -> AlignedPairs:
+    def metric(self, aligned: DraftedPairs) -> DraftedPairs:
         """A draft of the same pairs by a model with metric poses, where the user left the choice of the model open."""
         if aligned.alignment.poses is not None or aligned.alignment.on_sphere or self.options.model != "auto":
             return aligned
         return replace(self, options=replace(self.options, model="pose")).draft(aligned.pairs)
-
-
-def _filled(rows: ArrayLike, copies: Mapping[int, int]) -> FloatArray:
-    """Rows (N, D), one an image, those that begin with NaN from a copy of the image."""
-    result = np.array(rows, dtype=np.float64)
-    for copy, first in copies.items():
-        if np.isnan(result[first, 0]):
-            result[first] = result[copy]
-    return result
 
 
 def _no_overlap(paths: Sequence[str], pairs: Sequence[PairRegistration]) -> str:

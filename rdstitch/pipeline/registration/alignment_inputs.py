@@ -1,4 +1,4 @@
-"""What options, headers and tables say beforehand of the cameras that are aligned."""
+"""Options of the alignment and control points, from the user's options, headers and tables."""
 
 import math
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from rdstitch.system.file_access import canonical_name
 
 
 def alignment_options(sources: Sequence[Source], options: StitchOptions) -> AlignmentOptions:
-    """What is known of images as the camera stored them; attitudes that are not exact leave the mount's tilt open."""
+    """The options of the alignment, for images as stored; inexact attitudes leave the tilt of the mount free."""
     stored = QuarterTurns.of(sources).back
     measured = [source.attitude for source in sources if source.attitude is not None]
     attitudes = [attitude.tilt for attitude in measured]

@@ -43,6 +43,13 @@ class DetectedFeatures:
     equalized: tuple[int, ...] = ()  # images whose local contrast was equalized, as they showed too little otherwise
 
 
+@dataclass(frozen=True)
+class Unreadable:
+    """An image whose pixels cannot be read."""
+
+    reason: str
+
+
 def _detect_all(
     sources: Sequence[Source], options: FeatureOptions, run: Run, executor: Executor, store: Cache
 ) -> DetectedFeatures:
@@ -52,28 +59,30 @@ def _detect_all(
     of_batch = partial(detect_batch, options=options, store=store)
     tasks = ((of_batch, batch) for batch in batches(sources, _IMAGES_AT_ONCE, _MIN_BATCHES))
     for batch in run_on_sources(executor, tasks, run.guard):
-        for detected, problem in batch:
+        for detected in batch:
             index, source = len(features), sources[len(features)]
-            if problem:
+            if isinstance(detected, Unreadable):
                 if run.purpose is Purpose.PANO:
-                    raise InputError(problem)
-                run.guard.unreadable[source.path] = damaged[index] = problem
-            features.append(StoredFeatures.of(_no_features(options, source)) if detected is None else detected)
+                    raise InputError(detected.reason)
+                run.guard.unreadable[source.path] = damaged[index] = detected.reason
+                features.append(StoredFeatures.of(_no_features(options, source)))
+            else:
+                features.append(detected)
         run.progress("detecting features", len(features), len(sources))
     return DetectedFeatures(FeatureStore(tuple(features)), damaged, options.stretch)
 
 
 def detect_batch(
     sources: Sequence[Source], *, options: FeatureOptions, store: Cache
-) -> list[tuple[StoredFeatures | None, str]]:
-    """The features of each image, or None and why it cannot be read."""
+) -> list[StoredFeatures | Unreadable]:
+    """The features of each image."""
     reuse_freed_memory()  # also in a worker, whose later tasks return it
-    detected: list[tuple[StoredFeatures | None, str]] = []
+    detected: list[StoredFeatures | Unreadable] = []
     for source in sources:
         try:
-            detected.append((_detected(source, options, store), ""))
+            detected.append(_detected(source, options, store))
         except InputError as error:
-            detected.append((None, str(error)))
+            detected.append(Unreadable(str(error)))
     return detected
 
 
@@ -95,14 +104,17 @@ def _detected(source: Source, options: FeatureOptions, store: Cache) -> StoredFe
 
 
 def _no_features(options: FeatureOptions, source: Source) -> Features:
-    """Features of the same kind as those of the other images, but none of them."""
+    """An empty set of features of the same kind."""
     return replace(detect(np.zeros((1, 1), dtype=np.uint8), options), image_size=source.camera.image_size)
 
 
 def detect_by_contrast(
     sources: Sequence[Source], options: FeatureOptions, run: Run, executor: Executor, store: Cache
 ) -> DetectedFeatures:
-    """Detect the features of all images into ``store``, if necessary once more; damaged images of a panorama raise."""
+    """Detect the features of all images into ``store``, again and equalized if they show few.
+
+    Damaged images of a panorama raise.
+    """
     detect = partial(_detect_all, run=run, executor=executor, store=store)
     of_one = partial(_stretch_of_one, megapixels=options.limits[1], store=store)
 

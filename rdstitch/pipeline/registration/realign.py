@@ -1,16 +1,15 @@
-"""Pairs of a registration aligned anew: without images or pairs that failed, or as another motion."""
+"""Aligning the pairs of a registration again: without failed images or pairs, or as another motion."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from rdstitch.alignment.result import Alignment
 from rdstitch.alignment.sentences import explain_unaligned
-from rdstitch.choices import Purpose
 from rdstitch.errors import RegistrationError
 from rdstitch.matching.copies import copies_of
 from rdstitch.matching.two_view import Pair, PairRegistration
-from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.registration.aligner import AlignedPairs, Aligner
+from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import names_of
 from rdstitch.results.registration import Registration
 from rdstitch.system.cache import Cache
@@ -20,19 +19,19 @@ Rejected = Mapping[tuple[int, ...], str]
 """What is left out, with what is wrong: images (k,), and pairs (i, j) without which other images may fall off."""
 
 
-def aligner_of(registration: Registration, options: StitchOptions, purpose: Purpose) -> Aligner:
-    """What aligns the images of a registration anew."""
-    aligner = Aligner.of(registration.sources, options, Cache.at(options.cache), purpose)
-    return replace(aligner, needs_poses=purpose.poses)
+def aligner_of(registration: Registration, run: Run) -> Aligner:
+    """The aligner for aligning the images of a registration again."""
+    aligner = Aligner.of(registration.sources, run.options, Cache.at(run.cache), run.purpose)
+    return replace(aligner, needs_poses=run.purpose.poses)
 
 
 def with_reference_of(registration: Registration, aligner: Aligner) -> Registration:
-    """The pairs of a registration aligned anew, in the frame of the reference image of the aligner."""
+    """Align the pairs of a registration again, with the reference image of the aligner."""
     return _aligned_anew(registration, aligner.align(registration.pairs), aligner)
 
 
 def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Alignment], bool]) -> Registration | None:
-    """The images that are used aligned by another aligner; None where a draft is not wanted."""
+    """Align the used images by another aligner; None if that fails or its draft is not wanted."""
     try:
         draft = aligner.draft(registration.used_pairs)
         if not wanted(draft.alignment):
@@ -43,7 +42,7 @@ def realigned(registration: Registration, aligner: Aligner, wanted: Callable[[Al
 
 
 def plane_of_most(registration: Registration, aligner: Aligner, threads: int) -> Registration | None:
-    """Of two motions in the images that which may fill most of them; None where that is not to be seen."""
+    """The registration by the other of two motions if it may fill most of the images; else None."""
     if registration.static_background:
         return None
     pairs = planes_of_pairs(registration, aligner.threshold, threads)
@@ -54,7 +53,7 @@ def plane_of_most(registration: Registration, aligner: Aligner, threads: int) ->
 
 
 def by_second_motions(registration: Registration, chosen: Iterable[Pair], aligner: Aligner) -> Registration | None:
-    """The images that are used; some pairs, and their copies, by a motion of the matches that their own leaves over.
+    """The registration with some pairs, and their copies, by a second motion among their outliers.
 
     Where a scene has two surfaces, matches may say as much for one as for the other. None without a second motion.
     """
@@ -74,7 +73,7 @@ def by_second_motions(registration: Registration, chosen: Iterable[Pair], aligne
 
 
 def _with_pairs(registration: Registration, pairs: Sequence[PairRegistration], aligner: Aligner) -> Registration | None:
-    """The images aligned by other pairs; None where these do not fit together."""
+    """Align the images by other pairs; None if these do not fit together."""
     try:
         aligned = aligner.align(pairs)
     except RegistrationError:
@@ -83,7 +82,7 @@ def _with_pairs(registration: Registration, pairs: Sequence[PairRegistration], a
 
 
 def without(registration: Registration, rejected: Rejected, aligner: Aligner) -> Registration | None:
-    """The rest, aligned anew; None where nothing that fits together would be left.
+    """Align the rest again; None if nothing that fits together is left.
 
     Pairs that contradicted the rejected are judged again: it may have been the rejected that were wrong.
     """
@@ -121,7 +120,7 @@ def _neighbours_of(rejected: Mapping[int, str], registration: Registration) -> d
 def _aligned_anew(
     registration: Registration, aligned: AlignedPairs, aligner: Aligner, reasons: Mapping[int, str] | None = None
 ) -> Registration:
-    """The registration with another alignment, and why images are not in it, as far as that is known."""
+    """The registration with another alignment, and messages on the images that are not in it."""
     number = {path: k for k, path in enumerate(aligner.paths)}
     again = [message for message in registration.left_out if message.images[0] in number]  # the others were not read
     known = {**(reasons or {}), **{number[m.images[0]]: m.text for m in again}}

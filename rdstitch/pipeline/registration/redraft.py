@@ -1,4 +1,4 @@
-"""A draft of the alignment, made again with what it shows to be missing: pairs that close loops, and inliers."""
+"""Drafting the alignment repeatedly, with the loop closures and inliers that each draft adds."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,7 +10,7 @@ from rdstitch.matching.candidate_pairs import loop_closures
 from rdstitch.matching.pair_estimator import PairEstimator
 from rdstitch.matching.two_view import Pair, PairRegistration
 from rdstitch.numerics.robust_loss import sigma_of
-from rdstitch.pipeline.registration.aligner import AlignedPairs, Aligner
+from rdstitch.pipeline.registration.aligner import AlignedPairs, Aligner, DraftedPairs
 
 _ROUNDS = 2  # of registering more pairs and selecting inliers again at most, each by what the one before has shown
 _SETTLED = 0.05  # share of the inliers that must have changed for the images to be aligned again
@@ -22,8 +22,8 @@ _MIN_KEPT = 0.5
 
 def draft_with_loops(
     aligner: Aligner, estimator: PairEstimator, pairs: Sequence[PairRegistration], candidates: Sequence[Pair]
-) -> AlignedPairs:
-    """Draft the alignment, and anew with what a draft shows to be missing: pairs, and inliers.
+) -> DraftedPairs:
+    """Draft the alignment, and again with the pairs and inliers that a draft shows to be missing.
 
     Those are pairs of images that the poses put beside each other, candidate pairs of images without a pose, and, where
     the lens has more than λ, what it selects: with the one λ of a pair, matches at the corners of it are outliers.
@@ -65,7 +65,7 @@ def _agree(pairs: Sequence[PairRegistration], aligned: AlignedPairs, threshold: 
 
 
 def select_by_whole_lens(aligned: AlignedPairs, threshold: float) -> list[PairRegistration] | None:
-    """The pairs with the inliers that a lens of more than λ selects; None where these are hardly others."""
+    """The pairs with inliers by a lens of more than λ; None if these hardly change."""
     alignment, pairs = aligned.alignment, aligned.pairs
     if alignment.lens == "division" and not alignment.cameras[alignment.reference].higher:
         return None

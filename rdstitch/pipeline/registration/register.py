@@ -44,11 +44,11 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
     image that found no place.
     """
     options, purpose, progress = run.options.for_images(len(sources)), run.purpose, run.progress
-    cache = Cache.at(options.cache)
+    cache = Cache.at(run.cache)
     if options.known_distortion is None:
         sources = with_image_circle(sources, executor, cache, run.guard, options.features.limits[1])
     aligner = Aligner.of(sources, options, cache, purpose)
-    store = cache if options.cache is not None else Cache.for_this_run()
+    store = cache if run.cache is not None else Cache.for_this_run()
     with ThreadPoolExecutor(1) as thread:
         thread.submit(import_module, "scipy.sparse.csgraph")  # 0.15 s, which alignments would wait for
         detected = detect_by_contrast(sources, options.features, run, executor, store)
@@ -56,8 +56,9 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
     candidates = first_pairs(features, options.seed, positions_of(sources))
     return_freed_memory()
+    matching, known, tilts = _matching(options), options.estimation, aligner.exact_tilts
     estimator = PairEstimator(
-        features, cameras, _matching(options), options.estimation, progress, executor, cache, store, aligner.exact_tilts
+        features, cameras, matching, known, progress, executor, cache=cache, store=store, tilts=tilts
     )
     pairs = estimate_candidates(estimator, candidates)
     moving = without_static_background(estimator, pairs, candidates)
@@ -68,12 +69,12 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
     progress("aligning", 0, 1)
     pairs = [pair for pair in pairs if not {*pair.images} & other_lens.keys()]
     candidates = [pair for pair in candidates if not {*pair} & other_lens.keys()]
-    aligned = draft_with_loops(aligner, estimator, pairs, candidates)
+    draft = draft_with_loops(aligner, estimator, pairs, candidates)
     if purpose.poses:
         aligner = replace(aligner, needs_poses=True)
-        aligned = aligner.metric(aligned)
+        draft = aligner.metric(draft)
     progress("aligning", 0, 1)
-    aligned = aligner.completed(aligned)
+    aligned = aligner.completed(draft)
     settle = match_crossings if purpose.lens_only else settle_repeated_pattern
     aligned, undecided = settle(aligner, estimator, aligned, sources, detected.stretch, options.threads)
     unplaced = {**other_lens, **detected.damaged, **undecided}
@@ -97,14 +98,14 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
 
 
 def _matching(options: StitchOptions) -> FeatureMatching:
-    """By the user's network, or by distances of descriptors."""
+    """Matching by the user's network, or by distances of descriptors."""
     network = options.lightglue_model
     matcher = partial(match, ratio=options.ratio) if network is None else LightGlue(network).match
     return FeatureMatching(matcher, options.ratio, network)
 
 
 def _low_contrast(equalized: Sequence[int], alignment: Alignment, paths: Sequence[str]) -> list[Message]:
-    """That local contrast was equalized, and in which of the images aligned, unless in all images."""
+    """A message on the aligned images whose local contrast was equalized."""
     everywhere = len(equalized) == len(paths)
     images = () if everywhere else tuple(paths[k] for k in equalized if alignment.used[k])
     if not (everywhere or images):

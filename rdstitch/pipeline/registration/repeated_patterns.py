@@ -140,7 +140,10 @@ def match_crossings(
 def _matched(
     pair: PairRegistration, alignment: Alignment, crossings: Mapping[int, FloatArray], threshold: float
 ) -> PairRegistration:
-    """A pair by the crossings (N, 2), pixels, where the alignment expects them and no others near; as it was if few."""
+    """Match a pair by its crossings (N, 2), pixels, where the alignment expects them and no others are near.
+
+    A pair with few such matches stays as it is.
+    """
     first, second = crossings[pair.image1], crossings[pair.image2]
     expected = alignment.transfer(pair.image1, pair.image2, first)
     seen = np.flatnonzero(np.isfinite(expected).all(axis=1))

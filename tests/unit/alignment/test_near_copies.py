@@ -9,6 +9,7 @@ import pytest
 from examples.worlds.alignment_scenes import Scene, grid, grid_scene, jittered, scene, turn_links
 from examples.worlds.turns import camera_rotations
 from rdstitch.alignment import Alignment, AlignmentOptions, AlignmentTask, align
+from rdstitch.alignment.distinct_pairs import options_of_originals
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.alignment.least_squares.plane_marks import Sighting
 from rdstitch.alignment.motion_models import LOG_HEIGHT, PSI, THETA, YAW, X
@@ -134,3 +135,23 @@ def test_near_copies_of_images_that_are_not_aligned_are_left_out_with_them() -> 
 )
 def test_what_is_measured_in_a_near_copy_alone_makes_it_count(options: dict[str, object], left: dict[int, int]) -> None:
     assert without_measurements(NEAR, AlignmentOptions(**options)) == left  # type: ignore[arg-type]
+
+
+def test_what_a_copy_alone_has_is_given_of_its_image() -> None:
+    """The direction of gravity in the axes of that image, where a camera lay on its side, too."""
+    rows = {"positions": [3.0, 4.0], "positions_std": 2.0, "gravity": [0.6, 0.0, 0.8]}
+    given = {name: np.array([np.full_like(row, np.nan), row]) for name, row in rows.items()}
+    options = AlignmentOptions(**given)  # type: ignore[arg-type]
+    quarters = QuarterTurns((1, 6))
+    found = options_of_originals(options, {1: 0}, quarters)
+    np.testing.assert_array_equal(found.positions, [[3.0, 4.0]] * 2)
+    np.testing.assert_array_equal(found.positions_std, [2.0, 2.0])
+    np.testing.assert_array_equal(found.gravity, [quarters.directions(given["gravity"])[1], rows["gravity"]])
+    assert np.isnan(given["positions"][0]).all()
+
+
+def test_a_position_keeps_its_accuracy_beside_a_copy_that_has_a_better_one() -> None:
+    options = AlignmentOptions(positions=[[0.0, 0.0], [9.0, 5.0]], positions_std=[np.nan, 0.02])
+    found = options_of_originals(options, {1: 0}, QuarterTurns((1, 1)))
+    np.testing.assert_array_equal(found.positions, options.positions)
+    np.testing.assert_array_equal(found.positions_std, options.positions_std)

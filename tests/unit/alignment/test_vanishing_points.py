@@ -1,7 +1,4 @@
-"""Vanishing points, rectangles, and how much straightening may cut away."""
-
-from dataclasses import replace
-from typing import Any
+"""Vanishing points and rectangles."""
 
 import numpy as np
 import pytest
@@ -9,11 +6,6 @@ import pytest
 from examples.worlds.turns import camera_rotations
 from rdstitch.alignment.frames.vanishing_points import Edges, Focal, nearest_axis, of_edges, of_rectangle, of_scene
 from rdstitch.arrays import FloatArray
-from rdstitch.compositing import CompositeOptions
-from rdstitch.geometry.camera import Camera
-from rdstitch.pipeline.composition import straighten
-from rdstitch.results.placed_images import PlacedImages
-from tests.registrations import source
 
 FOCAL, PIXEL = 1.3, 1.0 / 600.0
 WALL = np.array([[-1.0, -0.7, 0.0], [1.0, -0.7, 0.0], [1.0, 0.7, 0.0], [-1.0, 0.7, 0.0]])
@@ -99,19 +91,3 @@ def test_few_lines_turn_as_little_as_will_do() -> None:
     assert edges.angles(upright.axes, FOCAL)[1, 0] < 1e-6
     assert np.degrees(np.arctan2(upright.axes[0, 1], upright.axes[0, 0])) == pytest.approx(-2.86, abs=0.2)
     assert abs(upright.axes[:, 2]).max() < 0.02
-
-
-@pytest.mark.parametrize(("projection", "done"), [("plane", False), ("sphere", True)])
-def test_no_straightening_that_cuts_most_away(projection: Any, done: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A camera that looked up by 50 degrees: upright and flat, the top would be stretched without end."""
-    lens = Camera((400, 300), 0.0, focal=260.0)
-    looks = np.stack([camera_rotations(yaw, 0.0, 0.0)[0] for yaw in (-0.3, 0.0, 0.3)])
-    directions = np.swapaxes(looks, 1, 2) @ np.diag([1.0, 1.0, 260.0 / lens.scale])
-    placed = PlacedImages([replace(source(f"{k}.jpg"), camera=lens) for k in range(3)], directions, 1, turned=True)
-    upwards = straighten.view_rotation(CompositeOptions(pitch=-50.0))
-    monkeypatch.setattr(straighten, "_upright", lambda placed, options: (upwards, []))
-    options = CompositeOptions(straighten="auto", projection=projection)
-    found, said = straighten.oriented(placed, options)
-    assert (found.orientation is not None) == done
-    assert [message.code for message in said] == ([] if done else ["not-straightened"])
-    assert done or "% of what the images show would be cut away" in said[0].text

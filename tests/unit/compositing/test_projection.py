@@ -8,6 +8,7 @@ import pytest
 
 from examples.worlds.compositing_scenes import as_image, gradient, grey, loader, place_images
 from examples.worlds.turns import TurningSequence, camera_rotations, turning_sequence
+from rdstitch.alignment.frames.reference_view import view_rotation
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import ProjectionName
 from rdstitch.compositing import Canvas, Composite, CompositeOptions, compose, plan_panorama
@@ -24,7 +25,6 @@ from rdstitch.geometry.planar_motion import rotation_from_tilt
 from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.read import DecodedImage
-from rdstitch.pipeline.composition.straighten import view_rotation
 from rdstitch.synthetic.rendering import Photometry
 
 LENS = Camera((160, 120), -0.2, focal=110.0, focal_source="option")

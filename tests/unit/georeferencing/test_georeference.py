@@ -24,15 +24,15 @@ from rdstitch.geometry.radial_homography import from_plane, to_plane
 from rdstitch.georeferencing.camera_views import views_of
 from rdstitch.georeferencing.georeference import Georeference, Residual, map_summary, world_file_paths
 from rdstitch.georeferencing.map_grid import MapGrid
-from rdstitch.georeferencing.place_on_map import AlignmentErrors, place_on_map
+from rdstitch.georeferencing.place_on_map import AlignmentErrors, MapPlacement, place_on_map
 from rdstitch.inputs.delays import MeasuredTilt
 from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.io.strips import ImageSpec
 from rdstitch.io.write import write_strips
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
-from rdstitch.pipeline.composition.map_canvas import plan_on_map
-from rdstitch.pipeline.output_messages import place_messages
+from rdstitch.pipeline.composition.map_canvas import canvas_on_map
+from rdstitch.pipeline.composition.output_messages import place_messages
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.report import report_page
 from rdstitch.results.stitch_result import StitchResult
@@ -220,7 +220,8 @@ class _Flight:
             replace(each, camera=self.camera, control=tuple(points), attitude=self.attitude)
             for each, points in zip(taken, control, strict=True)
         ]
-        return place_on_map(sources, self.to_output, AlignmentErrors(), epsg, force=force)
+        found = place_on_map(sources, self.to_output, AlignmentErrors(), epsg, force=force)
+        return found.place, found.reason or found.contradiction
 
 
 def _row(count: int) -> _Flight:
@@ -287,7 +288,7 @@ def test_what_lies_beyond_the_horizon_has_no_residual() -> None:
     row.to_output[4] *= -1.0
     place, _ = row.place()
     assert place.rejected == (Residual("4.jpg", None, None, used=False),)
-    texts = [message.text for message in place_messages(place, "", stitched(registration()).placed)]
+    texts = [message.text for message in place_messages(MapPlacement(place), stitched(registration()).placed)]
     assert "GPS positions that have no place in the output were not used: 4.jpg" in texts
 
 
@@ -423,7 +424,7 @@ def test_a_grid_out_of_all_proportion_is_refused_before_anything_is_made_of_it(p
     placed = replace(flown.placed, place=Georeference(Crs(32631), complex(0.05), 500_000.0 + 5_762_000.0j, 0.1))
     options = CompositeOptions(epsg=32631, gsd=pixel, extent=(400_000.0, 5_700_000.0, 600_000.0, 5_800_000.0))
     with pytest.raises(LimitError, match=r"the canvas would have .* pixels; choose a smaller extent, or larger pixels"):
-        plan_on_map(placed, options)
+        canvas_on_map(placed, options)
 
 
 def test_an_image_beyond_the_horizon_leaves_the_others_their_pixel() -> None:

@@ -13,7 +13,7 @@ from rdstitch.geometry.exif_orientation import turning_matrix
 from rdstitch.inputs.source import read_sources
 from rdstitch.io.write import write_image
 from rdstitch.options.stitch_options import StitchOptions
-from rdstitch.pipeline.given_camera import with_camera
+from rdstitch.pipeline.inputs.camera_and_odometry import with_camera
 from rdstitch.pipeline.recipes import mosaic
 
 K, D = [214.0, 0.0, 156.8, 0.0, 216.0, 122.6, 0.0, 0.0, 1.0], [-0.29, 0.09, -0.0009, 0.0008, -0.0135]

@@ -172,7 +172,7 @@ def test_what_contradicts_or_is_unknown_is_refused() -> None:
             recipe(*inputs, overwite=True)
     with pytest.raises(ArgumentError, match="no option 'scal'; do you mean 'scale'"):
         rdstitch.apply("none.json", ["none"], scal=0.5)
-    for wrong in ({"layout": "kiti"}, {"height": 0}, {"frame": "map"}):
+    for wrong in ({"file_format": "kiti"}, {"height": 0}, {"frame": "map"}):
         with pytest.raises(ArgumentError, match=f"{next(iter(wrong))} must be"):
             rdstitch.trajectory("none", **wrong)
 

@@ -59,28 +59,6 @@ def test_a_control_point_in_a_copy_counts(moved: float, orientation: int) -> Non
     assert found.leverage["P0"] > 0.05
 
 
-def test_what_a_copy_alone_has_is_given_of_its_image() -> None:
-    """The direction of gravity in the axes of that image, where a camera lay on its side, too."""
-    rows = {"positions": [3.0, 4.0], "positions_std": 2.0, "gravity": [0.6, 0.0, 0.8]}
-    given = {name: np.array([np.full_like(row, np.nan), row]) for name, row in rows.items()}
-    options = AlignmentOptions(**given)  # type: ignore[arg-type]
-    quarters = QuarterTurns((1, 6))
-    aligner = Aligner(("a", "b"), (Camera((640, 480)),) * 2, options, NO_CACHE, 3.0, quarters=quarters)
-    found = aligner._options_without({1: 0})
-    np.testing.assert_array_equal(found.positions, [[3.0, 4.0]] * 2)
-    np.testing.assert_array_equal(found.positions_std, [2.0, 2.0])
-    np.testing.assert_array_equal(found.gravity, [quarters.directions(given["gravity"])[1], rows["gravity"]])
-    assert np.isnan(given["positions"][0]).all()
-
-
-def test_a_position_keeps_its_accuracy_beside_a_copy_that_has_a_better_one() -> None:
-    options = AlignmentOptions(positions=[[0.0, 0.0], [9.0, 5.0]], positions_std=[np.nan, 0.02])
-    aligner = Aligner(("a", "b"), (Camera((640, 480)),) * 2, options, NO_CACHE, 3.0, QuarterTurns((1,) * 2))
-    found = aligner._options_without({1: 0})
-    np.testing.assert_array_equal(found.positions, options.positions)
-    np.testing.assert_array_equal(found.positions_std, options.positions_std)
-
-
 @pytest.mark.parametrize(("relief", "noise"), [(0.08, 0.0), (0.0, 0.5)])
 def test_a_near_copy_over_relief_or_blurred_is_counted_once(relief: float, noise: float) -> None:
     """Its image is off as much where another copy, whose pair with it fits, is there as well; so are its own pairs."""

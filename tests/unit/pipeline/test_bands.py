@@ -19,7 +19,7 @@ from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.bands import mosaic_bands
-from rdstitch.pipeline.output_plan import file_of_part
+from rdstitch.pipeline.outputs.output_files import file_of_part
 from rdstitch.pipeline.recipes import mosaic
 from rdstitch.sidecar.read import mismatch_with_image, read_sidecar
 from tests.cli.running import flight, sidecar_of

@@ -12,18 +12,18 @@ import pytest
 
 from examples.worlds.trust_sets import judge_set, trust_set
 from rdstitch.arrays import FloatArray
-from rdstitch.choices import Purpose
 from rdstitch.compositing import CompositeOptions, SeamBreak, SeamQuality
 from rdstitch.io.write import write_image
 from rdstitch.local_alignment import no_local_alignment
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.composition.choose_layout import _alternatives, _differs, _error, _Trials, choose_layout
-from rdstitch.pipeline.composition.compose import CanvasPlan
+from rdstitch.pipeline.composition.compose import CanvasLayout
 from rdstitch.pipeline.composition.lay_out import is_stretched
-from rdstitch.pipeline.output_messages import seam_messages
+from rdstitch.pipeline.composition.output_messages import seam_messages
 from rdstitch.pipeline.recipes import mosaic, pano
 from rdstitch.pipeline.registration.aligner import Aligner
 from rdstitch.pipeline.registration.realign import aligner_of, by_second_motions
+from rdstitch.pipeline.run import Run
 from rdstitch.results.placed_images import PlacedImages
 from rdstitch.results.registration import Registration
 from rdstitch.synthetic.textures import ground
@@ -50,7 +50,7 @@ OPTIONS = StitchOptions(workers=1, local_alignment="off", model="rigid", distort
 def _aligned_by_both(folder: Path) -> tuple[Registration, Registration, Aligner]:
     """By either surface, the farther one first."""
     far = registered(_of_two_surfaces(folder), OPTIONS, focal=None)
-    aligner = aligner_of(far, OPTIONS, Purpose.MOSAIC)
+    aligner = aligner_of(far, Run(OPTIONS))
     near = by_second_motions(far, [(0, 1)], aligner)
     assert near is not None
     return far, near, aligner
@@ -87,7 +87,7 @@ def test_images_aligned_by_the_surface_whose_seams_break_are_aligned_by_the_othe
 def test_where_heights_of_the_ground_explain_parallax_no_other_model_is_tried(by_heights: bool, tmp_path: Path) -> None:
     _, near, aligner = _aligned_by_both(tmp_path)
     trials = _Trials(OPTIONS, False, lambda image: np.empty((0, 2, 2)))
-    first = trials.lay_out(near, replace(no_local_alignment(""), by_heights=by_heights))
+    first = trials.judge(near, replace(no_local_alignment(""), by_heights=by_heights))
     assert first.faults
     assert bool(list(_alternatives(near, first, trials, aligner))) is not by_heights
 
@@ -116,7 +116,7 @@ def test_a_plane_seen_from_the_sideis_stretched(tilt: float, stretched: bool) ->
     oblique = np.eye(3)
     oblique[2, 0] = tilt
     placed = PlacedImages([source(), source()], np.stack([np.eye(3), oblique]), 0)
-    assert is_stretched(CanvasPlan.of(placed, CompositeOptions())) is stretched
+    assert is_stretched(CanvasLayout.of(placed, CompositeOptions())) is stretched
 
 
 def _quality(*breaks: SeamBreak, alike: float = 0.9) -> SeamQuality:

@@ -1,6 +1,6 @@
-"""The camera that the user gives, in a file or in a ROS bag."""
+"""The camera and the odometry that the user gives, in files or in a ROS bag."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,14 +10,21 @@ from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.exif_orientation import inverse, turned_size
 from rdstitch.inputs.find import find_images
 from rdstitch.inputs.frame import Named
-from rdstitch.inputs.rosbag import camera_in_bag, is_bag, only_bag
+from rdstitch.inputs.odometry import Odometry
+from rdstitch.inputs.rosbag import camera_in_bag, is_bag, odometry_in_bag, only_bag
 from rdstitch.io.metadata import read_metadata
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.results.messages import Message
 
 
-def read_camera(file: str | Path, inputs: Sequence[Named] = ()) -> tuple[Camera, list[Message]]:
-    """The camera of a file, without a size that of ``inputs``, or bag; where λ is fitted to another model, how well."""
+def read_camera(camera: Camera | str | Path, inputs: Sequence[Named] = ()) -> tuple[Camera, list[Message]]:
+    """Read a camera from its file or a bag; with a message on the fit if λ is fitted to another lens model.
+
+    Its size, where a file has none, is that of the first of ``inputs``.
+    """
+    if isinstance(camera, Camera):
+        return camera, []
+    file = camera
     if is_bag(Path(file)):
         if (calibrated := camera_in_bag(Path(file))) is None:
             raise InputError(f"{file}: the bag has no calibration in a topic of camera_info")
@@ -48,8 +55,8 @@ def _stored_size(file: str | Path, inputs: Sequence[Named]) -> tuple[int, int]:
 def with_camera(
     options: StitchOptions, inputs: Sequence[Named] = (), *, of_bag: bool
 ) -> tuple[StitchOptions, list[Message]]:
-    """Options with the camera whose file they name; without any, if wanted, with that of a bag; what to know of it."""
-    if isinstance(options.camera, str | Path):
+    """The options with their camera file read or, ``of_bag``, the calibration of the input bag; with messages."""
+    if options.camera is not None:
         camera, messages = read_camera(options.camera, inputs)
         return replace(options, camera=camera), messages
     bag = only_bag(inputs) if of_bag and options.known_distortion is None else None
@@ -59,3 +66,13 @@ def with_camera(
     text = f"the calibration in the bag, {topic}, is used; --camera FILE takes another one"
     note = Message(text, (str(bag),), "note")
     return replace(options, camera=file.camera, lens="auto", solver="auto"), [note]
+
+
+def with_odometry_of_bag(inputs: Iterable[Named], options: StitchOptions) -> StitchOptions:
+    """The options, with odometry read from the input bag if they name one of its topics."""
+    topic = options.odometry
+    if topic is None or isinstance(topic, Odometry) or Path(topic).is_file() or not str(topic).startswith("/"):
+        return options
+    if (bag := only_bag(inputs)) is None:
+        raise InputError(f"{topic}: no such file; a topic of odometry needs one ROS bag as input")
+    return replace(options, odometry=odometry_in_bag(bag, str(topic)))

@@ -1,7 +1,7 @@
-"""All files that a run writes: named and checked before its work, staged with its result."""
+"""The files that a run writes: checked before its work, staged with its result."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Self
@@ -33,8 +33,8 @@ def file_of_part(file: Path, part: str | int) -> Path:
 
 
 @dataclass(frozen=True)
-class PlannedFile:
-    """What is written beside an image, which is kept where this fails."""
+class FileBeside:
+    """A file or folder written beside an image, which is published even if this one fails."""
 
     place: Path  # the file, or folder, that the user named
     stage: Callable[[StitchResult], object]
@@ -47,49 +47,49 @@ class PlannedFile:
 
 
 @dataclass(frozen=True)
-class OutputPlan:
+class OutputFiles:
     """Every file that a run writes, and those that it reads."""
 
     run: Run
     read: Sequence[str | Path]
     images: Sequence[Path] = ()
     files: Sequence[Path] = ()  # besides the images and what belongs to these
-    beside: Sequence[PlannedFile] = ()
+    beside: Sequence[FileBeside] = ()
     replaced_bag: Path | None = None  # folder that another bag takes the place of
 
     @classmethod
     def of_images(
         cls,
         run: Run,
-        inputs: Iterable[str | Path],
+        inputs: Sequence[str | Path],
         names: Sequence[str] = (),
         more_images: Sequence[Path] = (),
         more_files: Sequence[Path] = (),
     ) -> Self:
-        """Of a run over images of these names; ``more_images`` may follow its output."""
+        """The files of a run over images of these names; ``more_images`` may be written after its output."""
         images = [*([] if run.output is None else [run.output]), *more_images]
-        return cls(run, [*inputs, *run.read], images, more_files, list(_files_beside(run, names)))
+        return cls(run, inputs, images, more_files, list(_files_beside(run, names)))
 
     @classmethod
     def of_path(
         cls,
         run: Run,
-        inputs: Iterable[str | Path],
+        inputs: Sequence[str | Path],
         output: str | Path | None,
         plot: str | Path | None,
         file_format: TrajectoryFormat,
     ) -> Self:
-        """Of a trajectory."""
+        """The files of a trajectory."""
         files, replaced = [Path(file) for file in (output, plot) if file is not None], None
         files += _camera_file(run)
         if file_format == "bag" and output is not None:
             check_bag(files[0], overwrite=run.options.overwrite)
             if files[0].is_dir() and run.options.overwrite:  # as the bags of ROS 2 are
                 replaced = files.pop(0)
-        return cls(run, [*inputs, *run.read], files=files, replaced_bag=replaced)
+        return cls(run, inputs, files=files, replaced_bag=replaced)
 
     def check(self) -> None:
-        """Find out before long work whether all can be written, over nothing read."""
+        """Refuse early what cannot be written, or would overwrite an input."""
         outputs = self.run.outputs
         for extra in self.beside:
             if extra.in_folder is not None:
@@ -100,9 +100,9 @@ class OutputPlan:
         check_not_read([] if self.replaced_bag is None else [self.replaced_bag], self.read)
 
     def check_places(self, sources: Sequence[Source], *, placed: bool = False) -> None:
-        """The same of files that place images on the Earth, once it is known whether there will be any.
+        """Check world files too, once it is known whether the output will be georeferenced.
 
-        By the positions of the images, or where they are ``placed`` by an earlier output.
+        It is by the positions of the images, or if they are ``placed`` by an earlier output.
         """
         run = self.run
         if run.options.composite.georeference != "off" and (placed or has_place(sources)):
@@ -115,7 +115,7 @@ class OutputPlan:
             )
 
     def stage(self, result: StitchResult) -> StitchResult:
-        """Stage what lies beside an image; the result with a warning for each file that fails."""
+        """Stage the files beside an image; the result gets a warning for each that fails."""
         for each in self.beside:
             result = result.with_messages(self.run.outputs.attempt(each.place, partial(each.stage, result)))
         return result
@@ -132,19 +132,20 @@ def save_camera(registration: Registration, run: Run) -> None:
 
 
 def stage_report(run: Run, result: Registration) -> list[Message]:
-    """Stage the report of what has no image, if one is wanted; a warning, where it fails."""
+    """Stage the report of a registration, if one is wanted; with a warning if that fails."""
     file = run.beside.report
-    return [] if file is None else run.outputs.attempt(file, partial(_write_report, run, file, result))
+    return [] if file is None else run.outputs.attempt(file, partial(_write_report, run, file, run.outputs, result))
 
 
 def report_refused(run: Run, refused: Registration) -> None:
-    """Write the report of a result that is refused, so that one can see why; what fails then is not the reason."""
-    with Outputs(overwrite=True) as outputs:
-        stage_report(replace(run, outputs=outputs), refused)
+    """Write the report of a refused result, which shows why; errors of the report itself are ignored."""
+    if (file := run.beside.report) is not None:
+        with Outputs(overwrite=True) as outputs:
+            outputs.attempt(file, partial(_write_report, run, file, outputs, refused))
 
 
 def _camera_file(run: Run) -> list[Path]:
-    """The camera file that is wanted, if any, of a format that there is."""
+    """The camera file, if one is wanted; its format is checked."""
     file = run.options.save_camera
     if file is None:
         return []
@@ -155,41 +156,41 @@ def _camera_file(run: Run) -> list[Path]:
 
 
 def _image_files(output: Path) -> list[Path]:
-    """An image and what always belongs to it: the sidecar, and the page of a Deep Zoom image."""
+    """An image with its sidecar, and with its page if it is a Deep Zoom image."""
     page = viewer_path(output)
     return [output, Path(f"{output}.json"), *([] if page is None else [page])]
 
 
-def _files_beside(run: Run, names: Sequence[str]) -> Iterator[PlannedFile]:
-    """What is written beside an image of images with these names."""
+def _files_beside(run: Run, names: Sequence[str]) -> Iterator[FileBeside]:
+    """The files beside an image that is composed of images with these names."""
     beside, outputs = run.beside, run.outputs
     for camera in _camera_file(run):
-        yield PlannedFile(camera, lambda result: save_camera(result.registration, run))
+        yield FileBeside(camera, lambda result: save_camera(result.registration, run))
     if (report := beside.report) is not None:
-        yield PlannedFile(check_suffix(report, _REPORT_SUFFIXES), partial(_write_report, run, report))
+        yield FileBeside(check_suffix(report, _REPORT_SUFFIXES), partial(_write_report, run, report, outputs))
     if (project := beside.hugin_project) is not None:
-        yield PlannedFile(project, partial(_write_hugin_project, project, outputs))
+        yield FileBeside(project, partial(_write_hugin_project, project, outputs))
     if (table := beside.poses) is not None:
         height = beside.height or 1.0
 
         def write_poses(result: StitchResult) -> None:
             outputs.write(table, text_bytes(poses_file(result, table, beside.frame, height)))
 
-        yield PlannedFile(table, write_poses)
+        yield FileBeside(table, write_poses)
     if (map_folder := beside.map_server) is not None:
         check_map_server(run.output, beside.height)
         write = partial(write_map, folder=map_folder, height=beside.height or 1.0, outputs=outputs)
-        yield PlannedFile(map_folder, write, map_files(map_folder))
+        yield FileBeside(map_folder, write, map_files(map_folder))
     if beside.layers is not None:
         layers = layer_files(names, beside.layers)
         stage = partial(stage_layers, files=layers, outputs=outputs, whole=beside.whole_layers)
-        yield PlannedFile(beside.layers, stage, [file for pair in layers.values() for file in pair])
+        yield FileBeside(beside.layers, stage, [file for pair in layers.values() for file in pair])
 
 
-def _write_report(run: Run, file: Path, result: StitchResult | Registration) -> None:
+def _write_report(run: Run, file: Path, outputs: Outputs, result: StitchResult | Registration) -> None:
     from rdstitch.report import write_report  # most runs have none
 
-    write_report(file, result, run.progress.stages, run.beside.command, outputs=run.outputs)
+    write_report(file, result, run.progress.stages, run.beside.command, outputs=outputs)
 
 
 def _write_hugin_project(file: Path, outputs: Outputs, result: StitchResult) -> None:

@@ -13,7 +13,7 @@ from rdstitch.viewer.page import ViewedImage, viewer_page, viewer_path
 
 
 def write_page(result: OutputImage, outputs: Outputs, images: Callable[[], Sequence[ViewedImage]]) -> list[Message]:
-    """Write the page of a ``.dzi`` output; others have none. A warning, where it cannot be written."""
+    """Write the page of a ``.dzi`` output, if it is one; with a warning if that fails."""
     output, written = result.output, result.written
     if output is None or written is None or (page := viewer_path(output)) is None:
         return []
@@ -28,12 +28,12 @@ def write_page(result: OutputImage, outputs: Outputs, images: Callable[[], Seque
 
 
 def plainly_viewed(canvas: Canvas, names: Sequence[str]) -> list[ViewedImage]:
-    """The images on a canvas, of which nothing was estimated."""
+    """The images on a canvas, without estimates."""
     return [ViewedImage(name, outlines, ()) for name, outlines in zip(names, canvas.outlines, strict=True)]
 
 
 def viewed_images(result: StitchResult) -> list[ViewedImage]:
-    """The images of a result with what was found of each."""
+    """The images of a result, each with its estimates."""
     alignment, registration = result.registration.alignment, result.registration
     names = [source.name for source in registration.sources]
     links_of = links_by_image(alignment.holding)

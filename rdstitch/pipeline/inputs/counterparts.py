@@ -1,12 +1,12 @@
-"""Which given image takes the place of which registered one: by name, what varies in the names, time, or position."""
+"""Assigning given images to registered ones: by name, by the varying part of names, by time, or by position."""
 
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from rdstitch.io.metadata import read_metadata
 from rdstitch.io.opening import check_readable
 from rdstitch.numerics.nearest_points import nearest_points
 from rdstitch.results.messages import Message, names_of, shortened
-from rdstitch.sidecar.image_record import ImageRecord
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.records import MatchedBy
 from rdstitch.system.file_access import canonical_name, canonical_text, without_query
@@ -31,36 +30,29 @@ Chosen = list[Frame | None]
 """For each image of the registration the frame that takes its place."""
 
 
-class _Taken(NamedTuple):
-    """When, s, and where an image was taken, as far as that is known."""
+@dataclass(frozen=True)
+class Counterparts:
+    """Which frames take the places of registered images."""
 
-    time: float | None = None
-    position: GpsPosition | None = None
+    chosen: Chosen
+    matched: MatchedBy  # by what they were found
+    unused: Sequence[Message] = ()  # on frames that take no place
 
 
-def counterparts(
-    saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy
-) -> tuple[Chosen, MatchedBy, list[Message]]:
-    """For each registered image the frame that takes its place, by what it was found, and which frames have none."""
+def find_counterparts(saved: SavedRegistration, frames: Sequence[Frame], match: MatchBy) -> Counterparts:
+    """Find the frame that takes the place of each registered image."""
     # Arrays have no names of their own.
     if match == "order" or all(frame.image is not None for frame in frames):
-        return list(_by_order(saved, frames)), "order", []
+        return Counterparts(list(_by_order(saved, frames)), "order")
     if match == "auto":  # read once, for whoever takes the frame
         frames = [_with_header(frame) for frame in frames]
-    ways: tuple[tuple[MatchedBy, Callable[[], Chosen | None]], ...] = (
-        ("name", lambda: _by_name(saved, frames, attrgetter("name"))),
-        ("name", lambda: _by_name(saved, frames, attrgetter("stem"))),
-        ("name", lambda: _by_varying_part(saved, frames)),
-        ("time", lambda: _by_measurement(saved, frames, _seconds)),
-        ("position", lambda: _by_measurement(saved, frames, _metres)),
-    )
-    for matched, find in ways[:3] if match == "name" else ways:
-        of_all = find() or [None] * len(saved.images)
+    for matched, find in _BY_NAMES if match == "name" else (*_BY_NAMES, *_BY_HEADERS):
+        of_all = find(saved, frames) or [None] * len(saved.images)
         chosen = [frame if image.used else None for image, frame in zip(saved.images, of_all, strict=True)]
         if any(frame is not None for frame in chosen):
             if matched == "name" and match == "auto":
                 _refuse_other_flights(saved, chosen)
-            return chosen, matched, _without_counterpart(of_all, frames)
+            return Counterparts(chosen, matched, _without_counterpart(of_all, frames))
     for path in files_of(frames):
         check_readable(path)
     wanted = next(image.name for image in saved.images if image.used)
@@ -99,9 +91,9 @@ def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[P
 
 
 def _refuse_other_flights(saved: SavedRegistration, chosen: Chosen) -> None:
-    """Refuse equal names of another flight, as cameras begin again at 1: times, or else places, tell them apart."""
+    """Refuse equal names of another flight, since cameras restart numbering, by times or else positions."""
     frames = [frame for frame in chosen if frame is not None]
-    near = next(filter(None, (_by_measurement(saved, frames, by) for by in (_seconds, _metres))), chosen)
+    near = next(filter(None, (_by_measurement(saved, frames, by) for by in (_times, _places))), chosen)
     for image, by_name, by_place in zip(saved.images, chosen, near, strict=True):
         if by_name is not None and by_place is not None and by_name is not by_place:
             raise InputError(
@@ -115,7 +107,7 @@ def _folders(frame: Frame) -> list[str]:
 
 
 def _by_varying_part(saved: SavedRegistration, frames: Sequence[Frame]) -> Chosen | None:
-    """By what differs between names of one side, as of V07_RED.jpg and V07_NIR.jpg."""
+    """Match by the part that varies among the names of each side, as in V07_RED.jpg and V07_NIR.jpg."""
     registered = _varying_parts([image.name for image in saved.images])
     given = _varying_parts([without_query(frame.path).name for frame in frames])
     if registered is None or given is None or not set(registered) & set(given):
@@ -125,7 +117,7 @@ def _by_varying_part(saved: SavedRegistration, frames: Sequence[Frame]) -> Chose
 
 
 def _varying_parts(names: Sequence[str]) -> list[tuple[str, ...]] | None:
-    """Of each name without suffix the parts that are not the same in all; None where these do not tell them apart."""
+    """The parts of each name that are not the same in all; None if they are not unique."""
     split = [_TOKEN.findall(Path(canonical_text(name)).stem) for name in names]
     if len(names) < 2 or len({len(parts) for parts in split}) != 1:
         return None
@@ -134,22 +126,30 @@ def _varying_parts(names: Sequence[str]) -> list[tuple[str, ...]] | None:
     return keys if max(Counter(keys).values()) == 1 else None
 
 
-def _seconds(taken: Sequence[_Taken]) -> FloatArray:
-    return np.array([[np.nan if one.time is None else one.time] for one in taken])
+def _times(saved: SavedRegistration, frames: Sequence[Frame]) -> FloatArray:
+    """Seconds (N + M, 1) at which registered images and frames were taken; NaN where unknown."""
+    of_frames = [None if frame.metadata is None else frame.metadata.timestamp for frame in frames]
+    times = [*(image.timestamp for image in saved.images), *of_frames]
+    return np.array([[np.nan if time is None else time] for time in times])
 
 
-def _metres(taken: Sequence[_Taken]) -> FloatArray:
-    return metres_around_median([one.position for one in taken])
+def _places(saved: SavedRegistration, frames: Sequence[Frame]) -> FloatArray:
+    """Metres (N + M, 2) east and north where registered images and frames were taken; NaN where unknown."""
+    of_images = [None if image.gps is None else GpsPosition(*image.gps) for image in saved.images]
+    of_frames = [None if frame.metadata is None else frame.metadata.gps for frame in frames]
+    return metres_around_median([*of_images, *of_frames])
 
 
 def _by_measurement(
-    saved: SavedRegistration, frames: Sequence[Frame], measure: Callable[[Sequence[_Taken]], FloatArray]
+    saved: SavedRegistration,
+    frames: Sequence[Frame],
+    measure: Callable[[SavedRegistration, Sequence[Frame]], FloatArray],
 ) -> Chosen | None:
-    """By what is nearer than half the way to the next registered image; None where most have no such counterpart."""
+    """Match frames within half the distance between registered images; None if most images have no such frame."""
     if any(frame.image is not None or frame.number is not None for frame in frames):
         return None
     count, used = len(saved.images), np.array([image.used for image in saved.images])
-    measured = measure([*map(_taken_image, saved.images), *map(_taken_frame, frames)])
+    measured = measure(saved, frames)
     registered, given = np.where(used[:, None], measured[:count], np.nan), measured[count:]
     known, known_given = (np.flatnonzero(np.isfinite(rows).all(axis=1)) for rows in (registered, given))
     if len(known) < 2 or not len(known_given):
@@ -163,16 +163,8 @@ def _by_measurement(
     return chosen if 2 * sum(frame is not None for frame in chosen) > used.sum() else None
 
 
-def _taken_image(image: ImageRecord) -> _Taken:
-    return _Taken(image.timestamp, None if image.gps is None else GpsPosition(*image.gps))
-
-
-def _taken_frame(frame: Frame) -> _Taken:
-    return _Taken() if frame.metadata is None else _Taken(frame.metadata.timestamp, frame.metadata.gps)
-
-
 def _with_header(frame: Frame) -> Frame:
-    """The frame with what its file's header says; of one that cannot be read who reads its pixels will say so."""
+    """The frame with its header, if it can be read; reading the pixels reports it otherwise."""
     if frame.image is not None or frame.number is not None or frame.metadata is not None:
         return frame
     try:
@@ -194,3 +186,15 @@ def _by_order(saved: SavedRegistration, frames: Sequence[Frame]) -> Sequence[Fra
             "the same names, or equally many"
         )
     return frames
+
+
+_Way = tuple[MatchedBy, Callable[[SavedRegistration, Sequence[Frame]], Chosen | None]]
+_BY_NAMES: tuple[_Way, ...] = (
+    ("name", partial(_by_name, key=attrgetter("name"))),
+    ("name", partial(_by_name, key=attrgetter("stem"))),
+    ("name", _by_varying_part),
+)
+_BY_HEADERS: tuple[_Way, ...] = (
+    ("time", partial(_by_measurement, measure=_times)),
+    ("position", partial(_by_measurement, measure=_places)),
+)

@@ -1,4 +1,4 @@
-"""From frames and options to the images that are registered."""
+"""Reading the images to be registered, with masks, attitudes, positions and control points."""
 
 from collections.abc import Sequence
 
@@ -19,7 +19,7 @@ from rdstitch.system.process_memory import return_freed_memory
 
 
 def in_order(frames: Sequence[Frame]) -> Sequence[Frame]:
-    """Files by their names where every pair is compared; of more images, and of arrays, the order tells neighbours."""
+    """Sort files by name if every pair is compared; of more images, or arrays, the given order shows neighbours."""
     if len(frames) > EXHAUSTIVE_UP_TO or any(frame.image is not None for frame in frames):
         return frames
     return sorted(frames, key=lambda frame: (natural_key(frame.path), frame.number or 0))
@@ -28,7 +28,7 @@ def in_order(frames: Sequence[Frame]) -> Sequence[Frame]:
 def read_frames(
     frames: Sequence[Frame], options: StitchOptions, guard: InputGuard, *, skip_bad: bool
 ) -> tuple[list[Source], list[Message]]:
-    """The images of frames, with what options say of their camera; and why others cannot be read."""
+    """Read frames with the camera of the options; with messages on those that cannot be read."""
     return read_sources(
         frames,
         camera=options.known_camera,
@@ -43,7 +43,7 @@ def read_frames(
 def read_inputs(
     frames: Sequence[Frame], options: StitchOptions, guard: InputGuard, *, skip_bad: bool
 ) -> tuple[list[Source], list[Message]]:
-    """The images that options leave, with what was measured of them; and why others cannot be read."""
+    """Read the selected images with all measurements; with messages on those that cannot be read."""
     # Before the first large image is freed.
     return_freed_memory()
     chosen = selected(frames, options.exclude, options.include_only)

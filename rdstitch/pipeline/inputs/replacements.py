@@ -1,4 +1,4 @@
-"""Which of the given images take the places of registered ones: read, corrected, and with the registered cameras."""
+"""Reading the images that take the places of registered ones, with corrections and the registered cameras."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from rdstitch.inputs.masks import with_masks
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.options.apply_options import ApplyOptions
 from rdstitch.pipeline.composition.flat_field import check_one_size, with_flat_field
-from rdstitch.pipeline.counterparts import counterparts
+from rdstitch.pipeline.inputs.counterparts import find_counterparts
 from rdstitch.results.messages import Message, left_out, merge_by_reason
 from rdstitch.sidecar.read import SavedRegistration
 from rdstitch.sidecar.records import MatchedBy
@@ -32,12 +32,12 @@ def read_replacements(
     saved: SavedRegistration, frames: Sequence[Frame], options: ApplyOptions, guard: InputGuard, max_memory: int | None
 ) -> Replacements:
     """Find, read and correct the images of the output: at least one, or, if strict, all that were registered."""
-    messages: list[Message] = []
+    notes: list[Message] = []
     stage = saved.record.stage
     if stage is not None:
-        frames, _, messages = tile_frames(frames, stage.z, stage.time)
-    chosen, matched, unmatched = counterparts(saved, frames, options.match)
-    sources, missing = _read(saved, chosen, guard, max_memory)
+        frames, _, notes = tile_frames(frames, stage.z, stage.time)
+    found = find_counterparts(saved, frames, options.match)
+    sources, missing = _read(saved, found.chosen, guard, max_memory)
     if options.strict and missing:
         raise PartialResultError("; ".join(map(str, merge_by_reason(missing.values()))))
     if not sources:
@@ -50,13 +50,14 @@ def read_replacements(
     if options.flat_field != "off":
         check_one_size(used)
         used, illumination = with_flat_field(used, options.flat_field)
-    return Replacements(dict(zip(sources, used, strict=True)), missing, matched, [*messages, *unmatched, *illumination])
+    messages = [*notes, *found.unused, *illumination]
+    return Replacements(dict(zip(sources, used, strict=True)), missing, found.matched, messages)
 
 
 def _read(
     saved: SavedRegistration, chosen: Sequence[Frame | None], guard: InputGuard, max_memory: int | None
 ) -> tuple[dict[int, Source], dict[int, Message]]:
-    """For each image that was used then the one in its place, with its camera, or why there is none."""
+    """Read the image in the place of each used one, with its camera; or a message why there is none."""
     sources: dict[int, Source] = {}
     missing: dict[int, Message] = {}
     for index, (image, frame) in enumerate(zip(saved.images, chosen, strict=True)):

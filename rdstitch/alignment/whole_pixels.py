@@ -1,15 +1,17 @@
 """Scans, screenshots and crops of one image: what was moved by whole pixels is put together without resampling."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from rdstitch.alignment.result import Alignment
 from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import Camera
 from rdstitch.matching.match_graph import spanning_forest, spanning_tree
+from rdstitch.matching.two_view import PairRegistration
 from rdstitch.numerics.robust_loss import RAYLEIGH_MEDIAN
-from rdstitch.results.registration import Registration
 from rdstitch.robust.posterior import Evidence
 
 _RESOLVED = 0.1  # standard deviation of the shift of a pair, pixels, up to which its matches can say that it is whole
@@ -18,20 +20,19 @@ _UPRIGHT = 0.01  # largest turn of the reference image in the output, radians, w
 _REASON = "moved by whole pixels, as parts of one image are"
 
 
-def on_whole_pixels(registration: Registration) -> Registration:
-    """The same registration, with motion by whole pixels and no lens where that explains the matches as well.
+def on_whole_pixels(alignment: Alignment, pairs: Sequence[PairRegistration]) -> Alignment:
+    """The same alignment of some pairs, by whole pixels and without a lens where that explains their matches as well.
 
     They are compared by their posterior, and the shifts of pairs must agree in every loop. A lens that was given, and a
     turn on the spot, stay.
     """
-    alignment = registration.alignment
     given = alignment.lens_given and any(any(camera.coefficients) for camera in alignment.cameras)
-    whole = None if alignment.on_sphere or given else _whole_shifts(registration)
+    whole = None if alignment.on_sphere or given else _whole_shifts(alignment, pairs)
     frame = alignment.homographies[alignment.reference] / alignment.homographies[alignment.reference][2, 2]
     linear = frame[:2, :2] - np.outer(frame[:2, 2], frame[2, :2])
     unit = math.sqrt(abs(float(np.linalg.det(linear))))
     if whole is None or np.abs(linear / unit - np.eye(2)).max() > _UPRIGHT:
-        return registration
+        return alignment
     # What was found of a camera over a plane is no property of a cut-out.
     cameras = tuple(Camera(c.image_size) for c in alignment.cameras)
     reference, homographies = cameras[alignment.reference], np.full_like(alignment.homographies, np.nan)
@@ -40,7 +41,7 @@ def on_whole_pixels(registration: Registration) -> Registration:
         middle = (shift + camera.center - reference.center) / reference.scale
         homographies[index] = np.diag([unit * camera.scale / reference.scale] * 2 + [1.0])
         homographies[index][:2, 2] = frame[:2, 2] + unit * middle
-    moved = replace(
+    return replace(
         alignment,
         cameras=cameras,
         homographies=homographies,
@@ -53,16 +54,14 @@ def on_whole_pixels(registration: Registration) -> Registration:
         parameters=(),
         covariance=np.empty((0, 0)),
     )
-    return replace(registration, alignment=moved)
 
 
-def _whole_shifts(registration: Registration) -> FloatArray | None:
+def _whole_shifts(alignment: Alignment, pairs: Sequence[PairRegistration]) -> FloatArray | None:
     """Where the images that are used begin in the reference image, (N, 2); None unless whole pixels fit."""
-    alignment = registration.alignment
     holding = {fit.images for fit in alignment.holding}
     number = np.cumsum(alignment.used) - 1
-    pairs, shifts, spread, residuals = [], [], [], []
-    for pair in registration.pairs:
+    numbers, shifts, spread, residuals = [], [], [], []
+    for pair in pairs:
         if pair.images not in holding:
             continue
         link = pair.link()
@@ -73,13 +72,13 @@ def _whole_shifts(registration: Registration) -> FloatArray | None:
         # Of most sets the first pair already says no.
         if np.median(np.linalg.norm(whole, axis=1)) > 0.5 + np.median(np.linalg.norm(fitted, axis=1)):
             return None
-        pairs.append((number[pair.image1], number[pair.image2]))
+        numbers.append((number[pair.image1], number[pair.image2]))
         shifts.append(shift)
         spread.append(float(np.median(np.linalg.norm(fitted, axis=1))) / RAYLEIGH_MEDIAN / math.sqrt(len(moved)))
         residuals.append((link.points1, whole, fitted))
-    if not pairs or max(spread) > _RESOLVED:
+    if not numbers or max(spread) > _RESOLVED:
         return None
-    first, second = np.array(pairs, dtype=np.intp).T
+    first, second = np.array(numbers, dtype=np.intp).T
     count, weight = int(alignment.used.sum()), np.ones(len(first))
     if len(spanning_forest(count, first, second, weight)) < count - 1:  # an image is held by none of them
         return None

@@ -1,11 +1,12 @@
-"""What the user should know of an output: its place, what is cut away, broken seams, colour profiles."""
+"""Messages on an output: georeference, cut-away parts, broken seams, colour profiles."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
 from rdstitch.compositing import Canvas, CompositeOptions, SeamBreak, SeamQuality
 from rdstitch.compositing.projection import PLANE
-from rdstitch.georeferencing.georeference import Georeference, check_summary, map_summary
+from rdstitch.georeferencing.georeference import check_summary, map_summary
+from rdstitch.georeferencing.place_on_map import MapPlacement
 from rdstitch.inputs.source import Source
 from rdstitch.io.colour import colour_space
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
@@ -15,7 +16,7 @@ from rdstitch.verification.limits import Limits
 
 
 def masked_messages(placed: PlacedImages) -> list[Message]:
-    """What was left out of every image."""
+    """How much of every image was masked as static."""
     if placed.static is None:
         return []
     fraction = float(placed.static.mean())
@@ -24,7 +25,7 @@ def masked_messages(placed: PlacedImages) -> list[Message]:
 
 
 def cut_away_messages(placed: PlacedImages, canvas: Canvas, options: CompositeOptions) -> list[Message]:
-    """How much of the images has no place in the output."""
+    """How much of the images is cut away because it would be stretched too far."""
     if placed.grid is not None or options.like is not None or options.extent is not None:
         return []
     fraction = canvas.cut_away(placed.cameras, placed.homographies)
@@ -36,16 +37,16 @@ def cut_away_messages(placed: PlacedImages, canvas: Canvas, options: CompositeOp
     return [Message(text, severity="note")] if fraction > Limits.visible_cut else []
 
 
-def place_messages(place: Georeference | None, reason: str, placed: PlacedImages) -> list[Message]:
-    """What the user should know of the place; nothing where hardly an image has a position."""
+def place_messages(placement: MapPlacement, placed: PlacedImages) -> list[Message]:
+    """Messages on the georeference; none if hardly an image has a position."""
     lost = [source for source in placed.sources if source.metadata.gps_problem]
     messages = [
         Message(f"{each.metadata.gps_problem}, and was not used; give --positions", (str(each.path),)) for each in lost
     ]
-    if place is None:
-        known = reason and placed.has_place
-        return [*messages, Message(f"not georeferenced: {reason}")] if known else messages
-    messages += [Message(reason)] if reason else []
+    if (place := placement.place) is None:
+        known = placement.reason and placed.has_place
+        return [*messages, Message(f"not georeferenced: {placement.reason}")] if known else messages
+    messages += [Message(placement.contradiction)] if placement.contradiction else []
     messages.append(Message(map_summary(place), severity="note"))
     if place.assumption:
         messages.append(Message(place.assumption))
@@ -62,9 +63,7 @@ def place_messages(place: Georeference | None, reason: str, placed: PlacedImages
 
 
 def seam_messages(seams: SeamQuality, paths: Sequence[str]) -> list[Message]:
-    """Where seams are broken, a warning where a person sees it, else a detail; of overlaps that are unlike, one warning
-    where no seams hold that say otherwise.
-    """
+    """A warning on broken seams, a detail if they are not visible; or a warning that most overlaps are dissimilar."""
     hold = len(seams.places) and seams.seams_fit
     if seams.mostly_unlike and not hold and seams.least_alike is not None:
         images = tuple(paths[k] for k in seams.least_alike)
