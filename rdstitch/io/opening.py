@@ -58,13 +58,13 @@ PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 # What reads which format, by its first bytes: Pillow opens some forty, and starts Ghostscript for one, whatever a
 # file is called. Readers are imported when they are needed.
 _FORMATS = {
-    b"\xff\xd8\xff": "PIL.JpegImagePlugin.jpeg_factory",
-    PNG_MAGIC: "PIL.PngImagePlugin.PngImageFile",
-    b"RIFF": "PIL.WebPImagePlugin.WebPImageFile",
-    b"BM": "PIL.BmpImagePlugin.BmpImageFile",
-    b"GIF8": "PIL.GifImagePlugin.GifImageFile",
-    **dict.fromkeys((b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP  \r\n\x87\n"), "PIL.Jpeg2KImagePlugin.Jpeg2KImageFile"),
-    **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), "PIL.PpmImagePlugin.PpmImageFile"),
+    b"\xff\xd8\xff": "PIL.JpegImagePlugin:jpeg_factory",
+    PNG_MAGIC: "PIL.PngImagePlugin:PngImageFile",
+    b"RIFF": "PIL.WebPImagePlugin:WebPImageFile",
+    b"BM": "PIL.BmpImagePlugin:BmpImageFile",
+    b"GIF8": "PIL.GifImagePlugin:GifImageFile",
+    **dict.fromkeys((b"\xff\x4f\xff\x51", b"\0\0\0\x0cjP  \r\n\x87\n"), "PIL.Jpeg2KImagePlugin:Jpeg2KImageFile"),
+    **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), "PIL.PpmImagePlugin:PpmImageFile"),
 }
 
 _BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
@@ -200,13 +200,13 @@ def _factory(file: Path, stream: BinaryIO) -> Any:
     if beginning[4:8] == b"ftyp":
         if beginning[8:12] in (b"avif", b"avis"):
             try:
-                return resolve_name("PIL.AvifImagePlugin.AvifImageFile")
+                return resolve_name("PIL.AvifImagePlugin:AvifImageFile")
             except ImportError:
                 raise InputError(f"{file}: AVIF needs Pillow 11.3 or newer; or convert it to JPEG or TIFF") from None
         # No opener is registered with Pillow, since that would be for the whole process.
         return reader_package("pillow_heif", file).HeifImageFile
     if file.suffix.lower() == ".tga":  # has no magic
-        return resolve_name("PIL.TgaImagePlugin.TgaImageFile")
+        return resolve_name("PIL.TgaImagePlugin:TgaImageFile")
     raise InputError(f"{file}: not an image in a supported format: {_NAMES}")
 
 
