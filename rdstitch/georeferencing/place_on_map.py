@@ -47,7 +47,7 @@ class MapPlacement:
 
     place: Georeference | None
     reason: str = ""  # why there is none
-    contradiction: str = ""  # what speaks against it
+    cautions: tuple[str, ...] = ()  # what speaks against it, or was not used
 
 
 def place_on_map(
@@ -58,7 +58,7 @@ def place_on_map(
     *,
     force: bool = False,
 ) -> MapPlacement:
-    """Place the output on the Earth, or say why that cannot be done; control points, where there are any, count alone.
+    """Place the output on the Earth, or say why that cannot be done; control points count alone where they suffice.
 
     ``sources`` are the N images that are used, with the cameras that were found; ``to_output`` (N, 3, 3) leads from
     normalized undistorted coordinates of each to pixels of the output. Without ``epsg`` the map is that of the control
@@ -66,19 +66,21 @@ def place_on_map(
     """
     points = _control_points(sources, to_output)
     control = [(point, pixel) for point, pixel in points if not point.check]
-    count, what = len(control), f"{len(control)} {PositionKind.CONTROL} are in the images"
-    if not control:
-        count = sum(source.metadata.gps is not None for source in sources)
-        what = f"{count} of {len(sources)} images have a GPS position"
-    if count < MIN_POSITIONS:
-        return MapPlacement(None, f"{what}, and {MIN_POSITIONS} are needed")
+    located = sum(source.metadata.gps is not None for source in sources)
+    by_control = len(control) >= MIN_POSITIONS
+    few = f"{len(control)} {PositionKind.CONTROL} are in the images, and {MIN_POSITIONS} are needed"
+    if not by_control and located < MIN_POSITIONS:
+        no_gps = f"{located} of {len(sources)} images have a GPS position, and {MIN_POSITIONS} are needed"
+        return MapPlacement(None, few if control else no_gps)
     views = views_of([source.camera for source in sources], to_output, [source.down for source in sources])
-    if not control:
-        return _placed(_of_positions(sources, views, errors), errors, epsg, force)
-    if epsg is None and control[0][0].epsg != WGS84:
+    if epsg is None and control and control[0][0].epsg != WGS84:
         epsg = control[0][0].epsg
-    found = _placed(_of_control(control, views, errors), errors, epsg, force)
-    place, checks = found.place, [(point, pixel) for point, pixel in points if point.check]
+    known = _of_control(control, views, errors) if by_control else _of_positions(sources, views, errors)
+    found = _placed(known, errors, epsg, force)
+    if control and not by_control:
+        caution = f"{few}: GPS positions place the map, and these check it"
+        found = replace(found, cautions=(*found.cautions, caution))
+    place, checks = found.place, [(point, pixel) for point, pixel in points if point.check or not by_control]
     if place is None or not checks:
         return found
     latitude, longitude = np.array([(point.place.latitude, point.place.longitude) for point, _ in checks]).T
@@ -182,4 +184,4 @@ def _placed(known: _KnownPlaces, errors: AlignmentErrors, epsg: int | None, forc
         map_scale=map_scale,
         assumption=assumption,
     )
-    return MapPlacement(place, contradiction=contradiction)
+    return MapPlacement(place, cautions=(contradiction,) if contradiction else ())

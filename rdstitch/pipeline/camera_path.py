@@ -1,10 +1,10 @@
 """The path of the camera, by its alignment and the wheel odometry of the same drive."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 
-from rdstitch.alignment import Alignment
 from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.errors import InputError
 from rdstitch.inputs.frame import frame_numbers
@@ -22,20 +22,20 @@ def camera_path(
     registration: Registration, odometry: Odometry | None, height: float | None
 ) -> tuple[Trajectory, list[Message]]:
     """The path, labelled by the images, in units of ``height`` of the first image or of the odometry; with messages."""
-    sources, messages = registration.sources, _scale_uncertainty(registration.alignment)
+    sources = registration.sources
     # Of the camera itself, whatever EXIF says of how its images are looked at.
     stored = QuarterTurns.of(sources).back.alignment(registration.alignment)
     path = Trajectory.from_alignment(stored, height or 1.0)
-    if odometry is not None:
-        length_std = registration.alignment.length_std
-        path, of_odometry = _along_odometry(path, sources, odometry, length_std, keep_unit=height is not None)
-        messages += of_odometry
+    if odometry is None:
+        messages = _scale_uncertainty(path)
+    else:
+        path, messages = _along_odometry(path, sources, odometry, keep_unit=height is not None)
     numbers = frame_numbers([source.frame for source in sources])
     return path.labelled([source.name for source in sources], numbers, timestamps_of(sources)), messages
 
 
 def _along_odometry(
-    path: Trajectory, sources: Sequence[Source], odometry: Odometry, length_std: float, *, keep_unit: bool
+    path: Trajectory, sources: Sequence[Source], odometry: Odometry, *, keep_unit: bool
 ) -> tuple[Trajectory, list[Message]]:
     """Fuse the path with odometry: its unit, unless ``keep_unit``, and poses of frames without one."""
     times = timestamps_of(sources)
@@ -45,23 +45,29 @@ def _along_odometry(
         seen = times[np.isfinite(times)]
         of = f"those of the images are from {seen.min():.3f} to {seen.max():.3f} s" if len(seen) else "images have none"
         raise InputError(f"{odometry.name}: has times from {first:.3f} to {last:.3f} s, {of}; give --timestamps")
-    along = along_odometry(path, bodies, length_std, keep_unit=keep_unit)
+    along, messages = along_odometry(path, bodies, keep_unit=keep_unit), _scale_uncertainty(path)
     if along is None:
-        return path, [Message(f"{odometry.name}: shows no motion of the images that have a pose; it is not used")]
-    (whole, fit), messages = along, list[Message]()
+        return path, [
+            *messages,
+            Message(f"{odometry.name}: shows no motion of the images that have a pose; it is not used"),
+        ]
+    whole, fit = along
     if not keep_unit:
-        text = f"lengths are those of the odometry, ± {fit.length_std:.1%}: the camera is at {whole.height[0]:.4g}"
-        messages.append(Message(text, severity="note"))
+        known, height_std = fit.length_std <= Limits.max_length_std, math.hypot(fit.length_std, path.length_std)
+        height = f"{whole.height[0]:.4g} ± {height_std:.1%}"
+        text = f"lengths are those of the odometry, ± {fit.length_std:.1%}: the camera is at {height}"
+        advice = "" if known else "; look at its units and times, drive straight ahead too, or give --height"
+        messages = [Message(f"{text}{advice}", severity="note" if known else "warning")]
     seen_frames = set(path.frame.tolist())
     if added := [sources[k].name for k in whole.frame.tolist() if k not in seen_frames]:
         messages.append(Message(f"placed by the odometry alone: {shortened(added)}", severity="note"))
     return whole, messages
 
 
-def _scale_uncertainty(alignment: Alignment) -> list[Message]:
-    """Warn if the focal length, and with it the scale of the path, is hardly known."""
-    if not alignment.length_std > Limits.max_length_std:
+def _scale_uncertainty(path: Trajectory) -> list[Message]:
+    """Warn if the focal length, and with it the scale of a path by images, is hardly known."""
+    if not path.length_std > Limits.max_length_std:
         return []
-    off = f"all lengths may be off together by {alignment.length_std:.0%}"
+    off = f"all lengths may be off together by {path.length_std:.0%}"
     text = f"{off}: the images hardly show the focal length; give --focal"
     return [Message(text, code="focal-unknown")]

@@ -76,7 +76,7 @@ class Pose:
 
     @property
     def length_std(self) -> float:
-        """Relative standard deviation that all lengths share, by the focal length; NaN where it is not known."""
+        """Relative standard deviation that all lengths share, by focal length or odometry; NaN where not known."""
         std = self.tracked.unit_std if self._by_odometry else self.tracked.length_std
         return math.nan if std is None else std
 
@@ -117,7 +117,10 @@ class Pose:
         height = pose.height if self._by_odometry else 0.0
         place, unit = np.array([pose.x, pose.y, height, 0.0]), np.array([self.unit] * 3 + [1.0])
         shared = 0.0 if math.isnan(self.length_std) else self.length_std
-        return np.asarray((self.tracked.covariance + shared**2 * np.outer(place, place)) * np.outer(unit, unit))
+        covariance = self.tracked.covariance + shared**2 * np.outer(place, place)
+        # In another unit than its own it is as uncertain as lengths by images, besides.
+        covariance[2, 2] += ((self.tracked.length_std or 0.0) * height) ** 2
+        return np.asarray(covariance * np.outer(unit, unit))
 
     @property
     def map(self) -> int | None:

@@ -113,12 +113,11 @@ def motions_of(poses: Sequence[tuple[complex, float, BodyPose | None]]) -> list[
 
 
 def along_odometry(
-    path: Trajectory, bodies: Mapping[int, BodyPose], length_std: float, *, keep_unit: bool
+    path: Trajectory, bodies: Mapping[int, BodyPose], *, keep_unit: bool
 ) -> tuple[Trajectory, OdometryFit] | None:
     """A path in the unit of the odometry, unless its own is kept, with poses of all frames that the odometry leads to.
 
-    ``bodies``: by the number of the frame; ``length_std``: relative standard deviation that all lengths of the path
-    share. None where the odometry shows no motion of the frames.
+    ``bodies``: by the number of the frame. None where the odometry shows no motion of the frames.
     """
     places = (path.position @ np.array([1.0, -1.0j])).tolist()
     known = [bodies.get(frame) for frame in path.frame.tolist()]
@@ -127,21 +126,27 @@ def along_odometry(
         return None
     if path.covariance is not None:
         each = zip(path.covariance, path.position, strict=True)
-        path = replace(path, covariance=np.array([_without_length(one, place, length_std) for one, place in each]))
+        path = replace(path, covariance=np.array([_without_length(one, place, path.length_std) for one, place in each]))
+    by_images = path.length_std
     if not keep_unit:
-        path, fit, length_std = *_in_unit_of(fit, path), fit.length_std
+        path, fit = _in_unit_of(fit, path)
     path = bridged(path, bodies, fit)
     if path.covariance is not None:
-        path.covariance[:, :2, :2] += length_std**2 * path.position[:, :, None] * path.position[:, None]
+        # A height that is the unit is exact; in another unit it is as uncertain as lengths by images, besides.
+        height = np.zeros(len(path)) if keep_unit else path.height
+        shared = path.length_std * np.column_stack([path.position, height, np.zeros(len(path))])
+        path.covariance[:] += shared[:, :, None] * shared[:, None]
+        path.covariance[:, 2, 2] += (by_images * height) ** 2
     return path, fit
 
 
 def _in_unit_of(fit: OdometryFit, path: Trajectory) -> tuple[Trajectory, OdometryFit]:
-    """The path in the unit of the odometry."""
+    """The path in the unit of the odometry, whose lengths it has."""
     unit, covariance = abs(fit.scale), path.covariance
     if covariance is not None:
         covariance = covariance * np.outer(change := np.array([unit, unit, unit, 1.0]), change)
-    scaled = replace(path, position=path.position * unit, height=path.height * unit, covariance=covariance)
+    position, height = path.position * unit, path.height * unit
+    scaled = replace(path, position=position, height=height, covariance=covariance, length_std=fit.length_std)
     by_unit = np.diag([1.0 / unit, 1.0])
     return scaled, replace(fit, scale=fit.scale / unit, covariance=by_unit @ fit.covariance @ by_unit)
 

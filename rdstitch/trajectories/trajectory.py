@@ -41,6 +41,8 @@ class Trajectory:
         s; NaN where not known.
     covariance : ndarray of shape (F, 4, 4), or None
         Of x, y, height and yaw, relative to the first frame, in the unit of the positions and radians.
+    length_std : float
+        Relative standard deviation that all lengths of the path share; NaN where not known.
     """
 
     frame: NDArray[np.intp]
@@ -51,6 +53,7 @@ class Trajectory:
     source_frame: NDArray[np.intp] | None = None
     timestamp: FloatArray | None = None
     covariance: FloatArray | None = None
+    length_std: float = math.nan
 
     def __post_init__(self) -> None:
         count = len(self.frame)
@@ -94,7 +97,7 @@ class Trajectory:
             raise ArgumentError(
                 "one homography per image has no metric poses; choose a planar model (rigid, similarity or tilting)"
             )
-        return cls.from_poses(alignment.poses, height)
+        return replace(cls.from_poses(alignment.poses, height), length_std=alignment.length_std)
 
     @classmethod
     def from_poses(cls, poses: PlanarPoses, height: float = 1.0) -> Self:

@@ -70,9 +70,9 @@ def trajectory(
         source, poses = source_to_follow(inputs, every, idle), FollowedPoses(height, frame or frame_of(file_format))
         with follow_for_trajectory(source, output, options, poses, plot=plot, file_format=file_format) as frames:
             print_followed(frames, reporter)
-            _, registration = recipe(frames.images, output, frames.given.options, progress=reporter, **how)
+            path, registration = recipe(frames.images, output, frames.given.options, progress=reporter, **how)
             print_result(registration, reporter, output)
     else:
-        _, registration = recipe(resolve(inputs), output, options, progress=reporter, **how)
+        path, registration = recipe(resolve(inputs), output, options, progress=reporter, **how)
         report_registration(registration, reporter)
-    reporter.made(f"{output}: {registration.summary}, lengths ± {registration.alignment.length_std:.2%}")
+    reporter.made(f"{output}: {registration.summary}, lengths ± {path.length_std:.2%}")

@@ -46,7 +46,7 @@ def place_messages(placement: MapPlacement, placed: PlacedImages) -> list[Messag
     if (place := placement.place) is None:
         known = placement.reason and placed.has_place
         return [*messages, Message(f"not georeferenced: {placement.reason}")] if known else messages
-    messages += [Message(placement.contradiction)] if placement.contradiction else []
+    messages += map(Message, placement.cautions)
     messages.append(Message(map_summary(place), severity="note"))
     if place.assumption:
         messages.append(Message(place.assumption))

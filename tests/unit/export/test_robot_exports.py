@@ -141,10 +141,13 @@ def test_what_is_no_fault_of_the_bag_is_not_called_one(tmp_path: Path, error: Ex
 
 
 @pytest.mark.parametrize(("height", "unit"), [(None, 0.5), (2.0, 0.5), (2.0, None)])
-def test_a_height_by_odometry_is_as_sure_as_all_its_lengths(height: float | None, unit: float | None) -> None:
+def test_a_height_by_odometry_is_as_sure_as_all_its_lengths_and_those_of_the_images(
+    height: float | None, unit: float | None
+) -> None:
     away = Placement(CAMERA, np.array([[1.0, 0.0, 3.0], [0.0, 1.0, 4.0], [0.0, 0.0, 1.0]]), 1.0)
-    tracked = TrackingResult(placement=away, covariance=np.zeros((4, 4)), length_std=0.1, unit=unit, unit_std=0.1)
+    tracked = TrackingResult(placement=away, covariance=np.zeros((4, 4)), length_std=0.3, unit=unit, unit_std=0.1)
     pose = Pose("a.jpg", 1, 0.0, tracked, poses=FollowedPoses(height))
     std = np.sqrt(np.diag(pose.ros_covariance))[:3]
     x, y, z = np.abs(pose.position)
-    np.testing.assert_allclose(std, 0.1 * np.array([x, y, 0.0 if height else z]))
+    expected = [0.3 * x, 0.3 * y, 0.0] if height else [0.1 * x, 0.1 * y, np.hypot(0.1, 0.3) * z]
+    np.testing.assert_allclose(std, expected)

@@ -221,7 +221,7 @@ class _Flight:
             for each, points in zip(taken, control, strict=True)
         ]
         found = place_on_map(sources, self.to_output, AlignmentErrors(), epsg, force=force)
-        return found.place, found.reason or found.contradiction
+        return found.place, found.reason or "".join(found.cautions)
 
 
 def _row(count: int) -> _Flight:
@@ -317,7 +317,26 @@ def test_control_points_place_the_output_instead_of_positions() -> None:
     few = [points if k < 2 else [] for k, points in enumerate(control)]
     assert "worst" in map_summary(place)
     assert "worst" not in map_summary(replace(place, residuals=()))  # as a sidecar may have it
-    assert replace(row, control=few).place()[1] == ("2 ground control points are in the images, and 3 are needed")
+    blind = replace(row, positions=[None] * len(row.positions), control=few)
+    assert blind.place()[1] == "2 ground control points are in the images, and 3 are needed"
+
+
+@pytest.mark.parametrize(("check", "count"), [(True, 3), (False, 2)])
+def test_points_that_do_not_place_the_output_check_a_map_by_positions(check: bool, count: int) -> None:
+    row = _row(8)
+    truth, _ = row.place()
+    points = []
+    for k, pixel in enumerate([(40.0, 90.0), (100.0, 20.0), (130.0, 200.0)][:count]):
+        ((latitude, longitude),) = truth.crs.geographic(truth.to_map([pixel]) + np.array([0.3, 0.0]))
+        (seen,) = from_plane(row.camera, row.to_output[0], np.array([pixel]))
+        known = GpsPosition(latitude, longitude)
+        points.append(GroundControl(f"P{k}", known, 32632, tuple(seen.tolist()), check=check))
+    place, caution = replace(row, control=[points, *[[]] * 7]).place()
+    assert (place.source, place.scale, place.origin) == (truth.source, truth.scale, truth.origin)
+    assert [one.name for one in place.checks] == [f"P{k}" for k in range(count)]
+    assert [one.east for one in place.checks] == pytest.approx([-0.3] * count, abs=1e-3)
+    few = "2 ground control points are in the images, and 3 are needed: GPS positions place the map, and these check it"
+    assert caution == ("" if check else few)
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def test_the_scale_and_the_mount_are_found_as_well_as_it_says() -> None:
     for seed in range(20):
         path = _path(seed)
         metres = replace(path, position=path.position * HEIGHT)
-        found = along_odometry(path, dict(enumerate(_bodies(metres, 0.02, seed))), 0.0, keep_unit=False)
+        found = along_odometry(path, dict(enumerate(_bodies(metres, 0.02, seed))), keep_unit=False)
         assert found is not None
         scaled, fit = found
         errors.append((scaled.height[0] / HEIGHT - 1.0) / np.sqrt(fit.length_std**2 - 0.01**2))
@@ -97,7 +97,7 @@ def _seen_and_stated(
     covariance[:, 3, 3] = yaw_std**2
     covariance[0] = 0.0
     yaw = true.yaw[seen] + yaw_std * moves * rng.normal(size=len(seen))
-    return metres, Trajectory(seen, found, yaw, true.height[seen], covariance=covariance), bodies
+    return metres, Trajectory(seen, found, yaw, true.height[seen], covariance=covariance, length_std=length_std), bodies
 
 
 @pytest.mark.parametrize(
@@ -113,22 +113,26 @@ def _seen_and_stated(
 def test_covariances_are_right_of_frames_with_texture_and_without(
     seen: NDArray[np.intp], keep_unit: bool, stated: tuple[float, float, float, float]
 ) -> None:
-    squares = []
+    squares, heights = [], []
     for seed in range(60):
         metres, shown, bodies = _seen_and_stated(seed, seen, *stated)
-        found = along_odometry(shown, bodies, stated[0], keep_unit=keep_unit)
+        found = along_odometry(shown, bodies, keep_unit=keep_unit)
         assert found is not None
-        path = found[0]
+        path, fit = found
+        assert path.length_std == pytest.approx((shown if keep_unit else fit).length_std)
         assert path.frame.tolist() == list(range(40))
         assert path.covariance is not None
         unit = HEIGHT if keep_unit else 1.0
         off = np.column_stack([path.position - metres.position / unit, path.yaw - metres.yaw])[1:]
         known = path.covariance[1:][:, [[0], [1], [3]], [0, 1, 3]]
         squares.append(np.einsum("ni,ni->n", off, np.linalg.solve(known, off[..., None])[..., 0]) / 3.0)
+        heights.append((path.height - metres.height / unit) ** 2 / np.maximum(path.covariance[:, 2, 2], 1e-12))
     of_each = np.mean(squares, axis=0)
     bridge = np.isin(np.arange(1, 40), seen, invert=True)
     assert 0.6 < of_each[bridge].mean() < 1.5
     assert 0.6 < of_each[~bridge].mean() < 1.5
+    # Of a camera in metres by the wheels the images know the height as well as their lengths; else it is the unit.
+    assert np.mean(heights) < 1e-6 if keep_unit else 0.6 < np.mean(heights) < 1.5
 
 
 def test_a_path_has_a_value_of_each_kind_a_frame() -> None:
@@ -183,6 +187,28 @@ def test_offline_and_live_give_metres_and_bridge_what_shows_nothing(drive: Rende
     places = np.array([poses[k].position[:2] for k in late])
     assert np.abs(places - _metres(drive).position[late]).max() < 0.08 * HEIGHT + 0.03
     assert 0.01 < poses[15].length_std < 0.03
+
+
+def test_which_lengths_are_uncertain_is_said_of_the_path_that_was_made(drive: RenderedSequence, tmp_path: Path) -> None:
+    """Straight down, images do not show the focal length: by wheels the path is known all the same, its height not."""
+    images = list(drive.frames())[:8]
+    files = _files(drive, tmp_path)
+    (tmp_path / "times.txt").write_text("".join(f"{0.1 * k}\n" for k in range(8)), encoding="utf-8")
+    options = rdstitch.StitchOptions(distortion=DISTORTION, model="similarity", **files)
+    for height, lengths in ((None, "the camera is at"), (HEIGHT, "all lengths may be off together")):
+        path, registration = rdstitch.trajectory(images, options=options, height=height)
+        texts = [text for text in map(str, registration.messages) if "lengths" in text]
+        assert [lengths in text for text in texts] == [True]
+        by_images = registration.alignment.length_std
+        assert by_images > 0.05
+        assert path.length_std == (by_images if height else pytest.approx(0.015, abs=0.01))
+    bodies = _bodies(_metres(drive), 0.5)
+    rows = "".join(f"{0.1 * k:.1f},{b.x},{b.y},{np.degrees(b.yaw)}\n" for k, b in enumerate(bodies))
+    files["odometry"].write_text(f"timestamp,x,y,yaw_deg\n{rows}", encoding="utf-8")
+    path, registration = rdstitch.trajectory(images, options=options)
+    (warning,) = (one for one in registration.messages if "lengths are those of the odometry" in one.text)
+    assert (warning.severity, path.length_std > 0.05) == ("warning", True)
+    assert warning.text.endswith("or give --height")
 
 
 def test_a_height_of_one_is_a_height() -> None:
