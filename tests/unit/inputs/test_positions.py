@@ -98,6 +98,16 @@ def test_json_with_groups_takes_the_value_with_a_sign(tmp_path: Path) -> None:
     assert place == GpsPosition(-33.9, 18.5)
 
 
+@pytest.mark.parametrize(
+    "altitude",
+    ["430 m Below Sea Level,", "430 m,Below Sea Level", "430,1", "-430,1", "430,3", "430 m,Negative Sea Level (…)"],
+)
+def test_altitudes_below_the_sea(tmp_path: Path, altitude: str) -> None:
+    heading = "SourceFile,GPSLatitude,GPSLongitude,GPSAltitude,GPSAltitudeRef\n"
+    rows = f"a.jpg,31.5,35.5,{altitude}\nb.jpg,31.5,35.5,1,0\nc.jpg,31.5,35.5,3 m,Above Sea Level\n"
+    assert [place and place.altitude for place in _read(tmp_path, heading + rows)] == [-430.0, 1.0, 3.0]
+
+
 @pytest.mark.parametrize("head", ["name,x,y,z", "EPSG:32734"])
 def test_projected_coordinates(tmp_path: Path, head: str) -> None:
     rows = ["a.jpg,268832.2996,6246117.7881,12", "b.jpg,268932.2996,6246117.7881,12"]
