@@ -34,6 +34,7 @@ _SIDE = 800.0  # pixels of the drawing's longer side
 _MARGIN = 60.0  # pixels
 _ARROWS = 40  # at most so many headings are drawn
 _POSE = ("x", "y", "height", "yaw_deg")  # in the order of covariances
+_MAX_STAMP = 2**31  # seconds of ROS have 32 bits: since 1970, until 2038
 _PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]
 _COLUMNS = ("frame", "name", "source_frame", "timestamp", "x", "y", "yaw_deg", "height")
 
@@ -162,6 +163,8 @@ def write_trajectory(
 ) -> None:
     """Stage the file, or the folder that is a bag of ROS 2, among the outputs."""
     frame = frame or frame_of(file_format)
+    if file_format == "bag" and (latest := np.abs(_times_or_numbers(path)).max()) >= _MAX_STAMP:
+        raise OutputError(f"{file}: a bag has no time of {latest:.0f} s since 1970; choose another format")
     if file_format != "bag":
         outputs.write(file, text_bytes(_WRITERS[file_format](path, frame)))
     elif file.suffix.lower() == ".bag":
