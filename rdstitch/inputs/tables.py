@@ -139,7 +139,8 @@ def csv_rows(
         headings = next(reader, [])
         present = set(map(column_of, headings))
         if not any({column_of(name) or name for name in names.split(",")} <= present for names in wanted):
-            raise InputError(f"{file}: its first line names no columns like {' or '.join(wanted)}")
+            found = f": '{heading.strip()[:60]}'" if heading.strip() else ""
+            raise InputError(f"{file}: its first line names no columns like {' or '.join(wanted)}{found}")
         rows = []
         for fields in reader:
             where = f"{file}: line {reader.line_num + start}"

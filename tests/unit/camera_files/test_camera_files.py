@@ -21,6 +21,7 @@ from rdstitch.choices import CameraFormat, FocalSource
 from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
+from rdstitch.pipeline.inputs.camera_and_odometry import read_camera
 from rdstitch.system.records import parse_yaml
 
 OPENCV = ["c.yml", "c.yaml", "opencv.json", "left.opencv.json", "a.fisheye.yml"]
@@ -549,6 +550,13 @@ def test_images_of_a_region_of_interest_are_of_a_part_of_the_sensor(tmp_path: Pa
     assert region.image_size == (400, 300)
     shown, offset = np.array([[0.0, 0.0], [399.0, 299.0], [50.0, 200.0]]), np.array([200.0, 60.0])
     np.testing.assert_allclose(region.undistort(shown) + offset, whole.undistort(shown + offset), atol=1.0)
+
+
+def test_that_a_lens_was_fitted_is_no_warning(tmp_path: Path) -> None:
+    file = _opencv_file(tmp_path / "c.yml", (900.0, 900.0), [-0.2, 0.05, 0.0, 0.0, 0.0], (1280, 960))
+    (message,) = read_camera(file)[1]
+    assert "was fitted to the OpenCV lens model, rms 0." in message.text
+    assert message.severity == "note"
 
 
 def test_a_file_without_a_size_takes_that_of_the_images(tmp_path: Path) -> None:
