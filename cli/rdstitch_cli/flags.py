@@ -33,6 +33,7 @@ def command(examples: str, *options: Iterable[click.Option]) -> Callable[[Callab
     def make(function: Callable[..., Any]) -> click.Command:
         @wraps(function)
         def run(*, quiet: bool, verbose: bool, **given: Any) -> Any:
+            _check_needs(flags, given)
             # Of the configuration, over which nothing may be written, the library knows nothing.
             if configuration := click.get_current_context().meta.get(CONFIG_FILE):
                 from rdstitch.system.output_checks import check_not_read
@@ -85,6 +86,17 @@ def values_of(kind: Any, given: Mapping[str, Any]) -> dict[str, Any]:
 def is_given(name: str) -> bool:
     """Check whether the user set an option of the running command, rather than left it at its default."""
     return click.get_current_context().get_parameter_source(name) not in (None, ParameterSource.DEFAULT)
+
+
+def _check_needs(flags: Sequence["Flag"], given: Mapping[str, Any]) -> None:
+    """Refuse an option of the command line that means nothing without others; in a configuration it may stand."""
+    context = click.get_current_context()
+    for flag in flags:
+        needed = [other for other in flags if other.name in flag.declared.needs]
+        stated = context.get_parameter_source(str(flag.name)) is ParameterSource.COMMANDLINE
+        if stated and needed and not any(given[str(other.name)] for other in needed):
+            goes_with = " or ".join(max(other.opts, key=len) for other in needed)
+            raise click.UsageError(f"{max(flag.opts, key=len)} goes with {goes_with}")
 
 
 def _flag(entry: Declared, default: Any) -> click.Option:

@@ -33,6 +33,7 @@ Idle = Annotated[
         "With --follow: end after so long without a frame; otherwise a folder is followed until Ctrl-C.",
         "SECONDS",
         within=Range(above=0.0),
+        needs=("following",),
     ),
 ]
 

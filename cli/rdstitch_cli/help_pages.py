@@ -60,14 +60,14 @@ class GroupedCommand(click.Command):
 
     def __init__(self, *arguments: Any, **given: Any) -> None:
         super().__init__(*arguments, **given)
-        if len(self.params) > _FEW:
-            how: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False, "callback": _show_all}
-            self.params.append(click.Option(["--help-all"], **how, help="Show all options."))
+        self.has_many = len(self.params) > _FEW
+        how: dict[str, Any] = {"is_flag": True, "is_eager": True, "expose_value": False, "callback": _show_all}
+        self.params.append(click.Option(["--help-all"], **how, help="Show all options."))
 
     def format_options(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the groups in their order, each with the options that this command has of it."""
         rows: dict[str, dict[int, tuple[str, str]]] = {group: {} for group, _, _ in _PLACES.values()}
-        brief = any(parameter.name == "help_all" for parameter in self.params) and not context.meta.get(_ALL)
+        brief = self.has_many and not context.meta.get(_ALL)
         left = 0
         for parameter in self.get_params(context):
             record = parameter.get_help_record(context)
@@ -86,7 +86,11 @@ class GroupedCommand(click.Command):
             formatter.write_text(f"{left} more options: {context.command_path} --help-all")
 
 
-@click.command("help", epilog="\b\nExamples:\n  rdstitch help\n  rdstitch help pano\n  rdstitch help no-overlap\n")
+@click.command(
+    "help",
+    cls=GroupedCommand,
+    epilog="\b\nExamples:\n  rdstitch help\n  rdstitch help pano\n  rdstitch help no-overlap\n",
+)
 @click.argument("topics", nargs=-1, metavar="[COMMAND|CODE]")
 @click.pass_context
 def help_command(context: click.Context, topics: Sequence[str]) -> None:

@@ -53,6 +53,15 @@ class _Matrix(Struct):
             raise ValueError("the shape is not what it should be")
 
 
+class _Region(Struct):
+    """The region of interest of a message of ROS, pixels, of which its images are; zeros stand for the whole image."""
+
+    x_offset: Count = 0
+    y_offset: Count = 0
+    width: Count = 0
+    height: Count = 0
+
+
 class _OpenCV(Struct, kw_only=True):
     """Brown's model with up to 8 coefficients, or that of ``cv2.fisheye`` with 4."""
 
@@ -62,6 +71,7 @@ class _OpenCV(Struct, kw_only=True):
     image_height: Side | None = None
     distortion_model: Literal["plumb_bob", "rational_polynomial", "equidistant", "fisheye"] | None = None
     fisheye_model: Count | None = None
+    roi: _Region | None = None
 
     def __post_init__(self) -> None:
         matrix, k = self.camera_matrix, self.coefficients
@@ -85,13 +95,19 @@ class _OpenCV(Struct, kw_only=True):
         return None if self.fisheye_model is None else self.fisheye_model > 0
 
     @property
+    def region(self) -> _Region | None:
+        """The part of the sensor that images show; None where they show all of it."""
+        return self.roi if self.roi and self.roi.width and self.roi.height else None
+
+    @property
     def coefficients(self) -> tuple[float, ...]:
         return tuple(self.distortion_coefficients.data)
 
     def lens(self, *, fisheye: bool) -> LensModel:
         """The lens, if its coefficients are those of the fisheye model, or of Brown's."""
         fx, _, cx, _, fy, cy = self.camera_matrix.data[:6]
-        return LensModel((fx, fy), (cx, cy), self.coefficients[:8], kind_of(fisheye))
+        x, y = (self.region.x_offset, self.region.y_offset) if self.region else (0, 0)
+        return LensModel((fx, fy), (cx - x, cy - y), self.coefficients[:8], kind_of(fisheye))
 
 
 def is_opencv(content: Any) -> bool:
@@ -137,6 +153,8 @@ def _record(content: dict[str, Any], file: str) -> _OpenCV:
             named[name] = {"rows": rows, "cols": len(values) // rows, **shape, "data": values}
         elif name in named and not shape:
             raise ArgumentError(f"{name}: expected rows, cols and data, or a list of numbers")
+    if not isinstance(named.get("roi"), dict):  # OpenCV's is of the undistorted image
+        named.pop("roi", None)
     if named.get("distortion_model") == "":
         raise ArgumentError("distortion_model: is empty, as of a camera that is not calibrated")
     return convert(named, _OpenCV, file, strict=False)
@@ -153,7 +171,8 @@ def _is_rather(fisheye: CameraFile, brown: CameraFile) -> bool:
 
 def _size(record: _OpenCV, image_size: ImageSize | None) -> tuple[int, int]:
     """Width and height, of the images where the file does not say them."""
-    given = record.image_width, record.image_height
+    shown = record.region
+    given = (shown.width, shown.height) if shown else (record.image_width, record.image_height)
     if given[0] is not None and given[1] is not None:
         return given[0], given[1]
     if image_size is None or given != (None, None):

@@ -34,6 +34,8 @@ _SIDE = 800.0  # pixels of the drawing's longer side
 _MARGIN = 60.0  # pixels
 _ARROWS = 40  # at most so many headings are drawn
 _POSE = ("x", "y", "height", "yaw_deg")  # in the order of covariances
+_MAX_STAMP = 2**31  # seconds of ROS have 32 bits: since 1970, until 2038
+_BY_SUFFIX: dict[str, TrajectoryFormat] = {".tum": "tum", ".kitti": "kitti", ".bag": "bag"}
 _PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]
 _COLUMNS = ("frame", "name", "source_frame", "timestamp", "x", "y", "yaw_deg", "height")
 
@@ -67,6 +69,14 @@ def path_as_svg(path: Trajectory, unit_name: str = "heights") -> str:
 <text x="20" y="{height - 26:.1f}" font-size="14">{scale:g} {unit_name}</text>
 </svg>
 """
+
+
+def format_of(output: str | Path | None, file_format: TrajectoryFormat) -> TrajectoryFormat:
+    """The format that is wanted, or that of the output's name."""
+    suffix = Path(output or "").suffix.lower()
+    if file_format == "auto" and suffix == ".svg":
+        raise OutputError(f"{output}: a drawing of the path is made by --plot, beside a file of poses")
+    return _BY_SUFFIX.get(suffix, "csv") if file_format == "auto" else file_format
 
 
 def frame_of(file_format: str) -> TrajectoryFrame:
@@ -162,6 +172,8 @@ def write_trajectory(
 ) -> None:
     """Stage the file, or the folder that is a bag of ROS 2, among the outputs."""
     frame = frame or frame_of(file_format)
+    if file_format == "bag" and (latest := np.abs(_times_or_numbers(path)).max()) >= _MAX_STAMP:
+        raise OutputError(f"{file}: a bag has no time of {latest:.0f} s since 1970; choose another format")
     if file_format != "bag":
         outputs.write(file, text_bytes(_WRITERS[file_format](path, frame)))
     elif file.suffix.lower() == ".bag":

@@ -106,7 +106,7 @@ def _read_attitudes(file: str | Path) -> Callable[[Sequence[Source]], list[Measu
     tilts = [_tilt_of(row) for row in rows]
     if any("name" in row.values for row in rows):
         return partial(_by_name, file, RowsByImage(rows))
-    times = np.array([row.needed("timestamp") for row in rows])
+    times = np.array([row.seconds() for row in rows])
     order = np.argsort(times, kind="stable")
     return partial(_by_time, file, times[order], np.array(tilts).reshape(-1, 2)[order])
 

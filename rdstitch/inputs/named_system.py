@@ -26,8 +26,8 @@ class NamedSystem:
     def named_by(cls, text: str) -> "NamedSystem | None":
         """The system; None where the text names none."""
         text = text.strip()
-        if code := re.fullmatch(r"EPSG:(\d{1,5})", text, re.IGNORECASE):
-            return cls(text.upper(), int(code[1]))
+        if code := re.fullmatch(r"(EPSG:(\d{1,5}))(\+\d{1,5})?", text, re.IGNORECASE):  # and the system of heights
+            return cls(code[1].upper(), int(code[2]))
         if code := re.fullmatch(r"WGS ?84[ /]*UTM(?: zone)? (\d{1,2}) ?([NS])", text, re.IGNORECASE):
             zone = int(code[1])
             return cls(text, epsg_of(zone if code[2] in "nN" else -zone)) if 1 <= zone <= 60 else None

@@ -11,7 +11,7 @@ import numpy as np
 
 from rdstitch.arrays import FloatArray
 from rdstitch.errors import InputError
-from rdstitch.inputs.tables import TIME_NAMES, csv_rows, is_number, numbered_lines
+from rdstitch.inputs.tables import TIME_NAMES, csv_rows, is_number, numbered_lines, seconds_of
 from rdstitch.inputs.time_gaps import in_gap
 from rdstitch.system.file_access import cached_by_file_state, read_text
 
@@ -97,7 +97,7 @@ def read_odometry(file: str | Path) -> Odometry:
         x_x, y_y, turn = (row.number(name) for name in ("cov_x_x", "cov_y_y", "cov_yaw_deg_yaw_deg"))
         place = math.nan if x_x is None or y_y is None else (x_x + y_y) / 2.0
         turned = math.nan if turn is None else math.radians(math.sqrt(max(turn, 0.0))) ** 2
-        table.append((row.needed("timestamp"), row.needed("x"), row.needed("y"), yaw, place, turned))
+        table.append((row.seconds(), row.needed("x"), row.needed("y"), yaw, place, turned))
     return odometry_of(table, where)
 
 
@@ -106,7 +106,7 @@ def _listed_pose(where: str, line: str) -> tuple[float, ...]:
     if len(parts) != _LISTED or not all(map(is_number, parts)):
         raise InputError(f"{where}: expected timestamp tx ty tz qx qy qz qw, found '{line}'")
     time, x, y, _, *turn = map(float, parts)
-    return time, x, y, yaw_of(unit_quaternion(turn, where)), math.nan, math.nan
+    return seconds_of(time, where), x, y, yaw_of(unit_quaternion(turn, where)), math.nan, math.nan
 
 
 def odometry_of(rows: Sequence[tuple[float, ...]], where: str) -> Odometry:

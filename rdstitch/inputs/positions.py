@@ -40,6 +40,7 @@ COLUMNS = {
     "y": "y northing north",
     "south": "gpslatituderef",
     "west": "gpslongituderef",
+    "below": "gpsaltituderef",
     "north_std": "rtkstdlat northstd horizontalaccuracy haccuracy hacc accuracy",
     "east_std": "rtkstdlon eaststd",
     "up_std": "rtkstdhgt upstd verticalaccuracy vaccuracy vacc",
@@ -47,6 +48,7 @@ COLUMNS = {
 _SIDES = (("latitude", "south"), ("longitude", "west"))
 _SIDE_WORDS = {"latitude": ("n", "north", "s", "south"), "longitude": ("e", "east", "w", "west")}
 _UNIT_WORDS = ["d", "deg", "degree", "degrees", "º", "m", "min", "minute", "minutes", "sec", "second", "seconds"]
+_BELOW_SEA = re.compile("below|negative|;[13]$", re.IGNORECASE)  # what exiftool makes of EXIF's 1 and 3, or these
 _LISTED = ("name", "x", "y", "altitude", "yaw", "pitch", "roll", "north_std", "up_std")  # in geo.txt
 _NUMBER_IN_WORD = re.compile(rf"(?:.*[,;])?{NUMERAL.pattern}")
 _WANTED = ("name,latitude,longitude", "name,x,y")
@@ -159,8 +161,8 @@ def _by_rows(rows: Sequence[Row | None], file: str, system: NamedSystem | None) 
             places.append(None)
             continue
         altitude = next(iter(row.numbers_within("altitude")), None)
-        if altitude is not None and "below" in row.values["altitude"].lower():
-            altitude = -altitude
+        if altitude is not None and _BELOW_SEA.search(f"{row.values['altitude']};{row.values.get('below', '')}"):
+            altitude = -abs(altitude)
         places.append(GpsPosition(*next(degrees), altitude, accuracy_of(row)))
     return places
 

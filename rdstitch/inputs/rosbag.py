@@ -107,12 +107,8 @@ def camera_in_bag(path: Path, topic: str | None = None) -> "tuple[CameraFile, st
                 return None
             if not _RECTIFIED.isdisjoint(name.split("_")) and p[0] > 0.0:
                 k, d = p.reshape(3, 4)[:, :3].ravel(), d[:0]
-            shown = message
-            if (region := message.roi).width and region.height:  # zeros stand for the whole image
-                shown = region
-                k = k - (0.0, 0.0, region.x_offset, 0.0, 0.0, region.y_offset, 0.0, 0.0, 0.0)
-            content: dict[str, Any] = {"width": int(shown.width), "height": int(shown.height), "k": k.tolist()}
-            content["d"] = d.tolist()
+            content: dict[str, Any] = {"width": int(message.width), "height": int(message.height)}
+            content |= {"k": k.tolist(), "d": d.tolist(), "roi": vars(message.roi)}
             if d.size:
                 content["distortion_model"] = message.distortion_model
             return camera_of_content(content, f"{path}: {connection.topic}"), connection.topic

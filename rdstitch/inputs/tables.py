@@ -35,6 +35,7 @@ from rdstitch.system.records import parse_json
 
 IMAGE_NAMES, TIME_NAMES = "name filename file image imagename", "timestamp time stamp"  # of columns
 
+_MAX_SECONDS = 1e11  # since 1970, in the year 5138; since 1973 milliseconds are more
 _DELIMITERS = ",;\t"
 _SEPARATOR = re.compile("sep=.?", re.IGNORECASE)
 _HEADING = re.compile(r"(?:.*:)?([^\[(]*)(?:[\[(]([^\])]*)[\])]?.*)?", re.DOTALL)
@@ -79,6 +80,10 @@ class Row:
             raise InputError(f"{self.where}: has no number for {column}")
         return value
 
+    def seconds(self) -> float:
+        """The time stamp, which the row must have."""
+        return seconds_of(self.needed("timestamp"), self.where)
+
     def numbers_within(self, column: str) -> list[float]:
         """All numbers in a text like ``48 deg 51' 29.60" N``."""
         values = (self._parsed(part) for part in NUMERAL.findall(self.values.get(column, "")))
@@ -98,6 +103,13 @@ def is_number(text: str) -> bool:
         return isfinite(float(text))
     except ValueError:
         return False
+
+
+def seconds_of(time: float, where: str) -> float:
+    """A time in seconds; one that can only be in a smaller unit is refused."""
+    if abs(time) > _MAX_SECONDS:
+        raise InputError(f"{where}: expected a time in seconds, not {time:.0f}; is it in nanoseconds?")
+    return time
 
 
 def name_parts(text: str) -> tuple[str, ...]:
@@ -127,7 +139,8 @@ def csv_rows(
         headings = next(reader, [])
         present = set(map(column_of, headings))
         if not any({column_of(name) or name for name in names.split(",")} <= present for names in wanted):
-            raise InputError(f"{file}: its first line names no columns like {' or '.join(wanted)}")
+            found = f": '{heading.strip()[:60]}'" if heading.strip() else ""
+            raise InputError(f"{file}: its first line names no columns like {' or '.join(wanted)}{found}")
         rows = []
         for fields in reader:
             where = f"{file}: line {reader.line_num + start}"

@@ -13,7 +13,7 @@ from rdstitch.errors import InputError
 from rdstitch.inputs.frame import Frame, frame_numbers
 from rdstitch.inputs.rows_of_images import RowsByImage
 from rdstitch.inputs.source import Source
-from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, csv_rows, is_number, numbered_lines
+from rdstitch.inputs.tables import IMAGE_NAMES, TIME_NAMES, Row, csv_rows, is_number, numbered_lines, seconds_of
 from rdstitch.system.file_access import cached_by_file_state, read_text
 
 _COLUMNS = {"name": IMAGE_NAMES, "timestamp": TIME_NAMES}
@@ -56,7 +56,7 @@ def time_of(frame: Frame, file: str | Path) -> float | None:
 
 
 def _by_name(rows: RowsByImage, frames: Sequence[Frame], file: str | Path) -> list[float]:
-    return [row.needed("timestamp") for row in rows.needed(frames, file, "time")]
+    return [row.seconds() for row in rows.needed(frames, file, "time")]
 
 
 def _by_number(times: Sequence[float], frames: Sequence[Frame], file: str | Path) -> list[float]:
@@ -81,7 +81,7 @@ def _read_times(file: str | Path) -> list[float] | RowsByImage:
     text = read_text(file)
     lines = numbered_lines(text, str(file))
     if lines and all(is_number(line) for _, line in lines):
-        return [float(line) for _, line in lines]
+        return [seconds_of(float(line), where) for where, line in lines]
     if not lines or not is_number(lines[0][1].split()[0]):
         rows = csv_rows(text, str(file), _COLUMNS, ("name,timestamp",), {"timestamp": "s"})
     else:

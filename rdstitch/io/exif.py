@@ -97,7 +97,7 @@ def gps_position(tags: dict[int, Any], xmp: str) -> tuple[GpsPosition | None, st
     if sides[0] not in ("N", "S") or sides[1] not in ("E", "W"):
         return None, "its GPS position does not say whether north or south, east or west"
     altitude = finite(tags.get(ExifTags.GPS.GPSAltitude))
-    below_sea = tags.get(ExifTags.GPS.GPSAltitudeRef) in (1, b"\x01")
+    below_sea = tags.get(ExifTags.GPS.GPSAltitudeRef) in (1, 3, b"\x01", b"\x03")  # 3: since EXIF 3.0
     accuracies = (("RtkStdLat", "RtkStdLon", "RtkStdHgt"), ("GPSXYAccuracy", "GPSXYAccuracy", "GPSZAccuracy"))
     deviations = [[xmp_number(xmp, name) or 0.0 for name in names] for names in accuracies]
     along, across, up = next((each for each in deviations if min(each) > 0.0), (0.0, 0.0, 0.0))

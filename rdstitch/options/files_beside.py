@@ -29,15 +29,10 @@ class ImageFiles(ReportFile):
         "enblend reads.",
         "DIR",
     )
-    whole_layers: bool = option(False, "With --layers: on the whole canvas instead of cropped.")
+    whole_layers: bool = option(False, "With --layers: on the whole canvas instead of cropped.", needs=("layers",))
     hugin_project: Path | None = writes(
         "Write a project for Hugin (.pto): all images with lens and pose, and control points."
     )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.whole_layers and self.layers is None:
-            raise ArgumentError("whole layers need a folder of layers: --whole-layers goes with --layers DIR")
 
 
 @documented

@@ -75,6 +75,7 @@ class Option:
     unit: Unit | None = None
     none: str = ""  # the word for None on the command line
     file: FileUse | None = None
+    needs: tuple[str, ...] = ()  # names of options; without any of them it means nothing
 
     def in_unit(self, unit: Unit | None) -> str:
         """The text, of angles in a unit."""

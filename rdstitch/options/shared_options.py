@@ -44,6 +44,7 @@ Height = Annotated[
         "Height of the first frame above the plane, whose unit positions have; else they are in heights.",
         "H",
         within=Range(above=0.0),
+        needs=("poses", "map_server"),
     ),
 ]
 Distortion = Annotated[

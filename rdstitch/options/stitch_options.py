@@ -72,6 +72,7 @@ class StitchOptions(RansacOptions, RunOptions):
         "DEG",
         within=Range(least=0.0, most=math.pi / 2),
         unit=Unit.RADIANS,
+        needs=("attitude",),
     )
     timestamps: str | Path | None = reads(
         "Time stamps of the images: CSV name,timestamp, lines TIME NAME, or a time a line; otherwise those of the "
@@ -86,7 +87,9 @@ class StitchOptions(RansacOptions, RunOptions):
         "Where images were taken, instead of EXIF: CSV name,lat,lon or name,x,y (see --crs), exiftool's -csv or "
         "-json, OpenDroneMap's geo.txt, or a GPX track."
     )
-    positions_offset: float = option(0.0, "Seconds from the times of the images to those of the GPX track (UTC).", "S")
+    positions_offset: float = option(
+        0.0, "Seconds from the times of the images to those of the GPX track (UTC).", "S", needs=("positions",)
+    )
     position_accuracy: float | None = option(
         None,
         "Standard deviation of a horizontal coordinate of positions that state none, metres.",
@@ -133,6 +136,7 @@ class StitchOptions(RansacOptions, RunOptions):
         "Format of the camera file written. auto: by its name, .json (rdstitch), .yml (OpenCV), .fisheye.yml, "
         ".pto (Hugin), .xml (lensfun), cameras.json (OpenDroneMap), cameras.txt (COLMAP), camera_info.yaml (ROS), "
         "camchain.yaml (Kalibr).",
+        needs=("save_camera",),
     )
 
     def __post_init__(self) -> None:

@@ -46,9 +46,13 @@ class TileOptions(RunOptions):
     )
     columns: int | None = option(None, "With {number}: tiles in a row.", within=Range(least=1))
     order: ScanOrder = option("rows", "With {number}: how tiles follow each other; snake: to and fro.")
-    origin: Origin = option("top-left", "With --grid: where the first tile is.")
+    origin: Origin = option("top-left", "With --grid: where the first tile is.", needs=("grid",))
     overlap: float = option(
-        10.0, "With --grid: overlap of neighbouring tiles.", "PERCENT", within=Range(least=0.0, below=100.0)
+        10.0,
+        "With --grid: overlap of neighbouring tiles.",
+        "PERCENT",
+        within=Range(least=0.0, below=100.0),
+        needs=("grid",),
     )
     pixel_size: float | None = option(
         None, "Pixel size, micrometres, if no file states it.", "UM", within=Range(above=0.0)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rdstitch.choices import Purpose, TrajectoryFormat, TrajectoryFrame
 from rdstitch.errors import RegistrationError
-from rdstitch.export.trajectory_files import has_times, path_as_svg, write_trajectory
+from rdstitch.export.trajectory_files import format_of, has_times, path_as_svg, write_trajectory
 from rdstitch.inputs.find import FoundImages
 from rdstitch.inputs.frame import Images, frame_numbers
 from rdstitch.inputs.odometry import as_odometry
@@ -197,7 +197,7 @@ def trajectory(
     output: str | Path | None = None,
     options: StitchOptions | None = None,
     *,
-    file_format: TrajectoryFormat = "csv",
+    file_format: TrajectoryFormat = "auto",
     plot: str | Path | None = None,
     height: float | None = None,
     frame: TrajectoryFrame | None = None,
@@ -213,7 +213,8 @@ def trajectory(
     output : path, optional
         File to write.
     file_format : str
-        "csv", "tum", "kitti" or "bag", see :mod:`rdstitch.export.trajectory_files`.
+        "csv", "tum", "kitti" or "bag", see :mod:`rdstitch.export.trajectory_files`; "auto": by the suffix of the
+        output, otherwise "csv".
     plot : path, optional
         SVG file to draw the path to.
     height : float, optional
@@ -230,6 +231,7 @@ def trajectory(
     for name, kind, value in (("file_format", TrajectoryFormat, file_format), ("height", Height, height)):
         check_parameter(name, kind, value)
     check_parameter("frame", TrajectoryFrame | None, frame)
+    file_format = format_of(output, file_format)
     given = RecipeInput.of(inputs, options, Purpose.TRAJECTORY, every)
     run = Run.of(given, progress=progress)
     with given.find_images() as images, run.outputs:

@@ -23,6 +23,7 @@ from rdstitch.system.file_access import read_text
 Positions = str | Path | ArrayLike | Mapping[str, ArrayLike]
 
 _COLUMNS = {"name": "name file filename image", "x": "x xpx", "y": "y ypx", "x_um": "xum", "y_um": "yum"}
+_UNITS = {"x": "px um", "y": "px um"}
 _PARTS = {"row": r"\d+", "col": r"\d+", "letter": "[A-Za-z]{1,2}", "number": r"\d+"}
 _PATTERNS = ({"row", "col"}, {"letter", "col"}, {"number"})
 _FIJI = re.compile(r"\s*(?P<name>[^;#]+?)\s*;[^;]*;\s*\(\s*(?P<x>[^,()]+),\s*(?P<y>[^,()]+)(,[^()]*)?\)\s*")
@@ -127,7 +128,7 @@ def grid_from_table(
     text = read_text(file)
     lines = enumerate(map(_FIJI.fullmatch, text.splitlines()), start=1)
     rows = [Row(f"{file}: line {number}", fitting.groupdict(), ".") for number, fitting in lines if fitting is not None]
-    rows = rows or csv_rows(text, str(file), _COLUMNS, ("name,x,y", "name,x_um,y_um"))
+    rows = rows or csv_rows(text, str(file), _COLUMNS, ("name,x,y", "name,x_um,y_um"), _UNITS)
     x, y, unit = ("x", "y", None) if any("x" in row.values for row in rows) else ("x_um", "y_um", 1.0)
     tiles = [Frame(Path(name), label=name) for name in names]
     places = [(row.needed(x), row.needed(y)) for row in RowsByImage(rows).needed(tiles, file, "place")]

@@ -55,7 +55,8 @@ def test_a_common_option_is_that_of_the_command_that_runs(tmp_path: Path) -> Non
 def test_flags_win_then_the_command_then_common(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     file = _written(
         tmp_path,
-        "[common]\nlambda = -0.15\nseed = 7\nthreshold = 2.5\n[pano]\nlambda = -0.2\nscale = 0.5\nworkers = 1\n",
+        "[common]\nlambda = -0.15\nseed = 7\nthreshold = 2.5\nattitude-std = 2\nwhole-layers = true\n"
+        "[pano]\nlambda = -0.2\nscale = 0.5\nworkers = 1\n",
     )
     arguments = ("pano", *frames[:2], "--config", file, "--max-features", "600")
     assert rdstitch(*arguments, "-o", tmp_path / "a.png").out == "-0.200000\n"

@@ -83,7 +83,12 @@ def _check(rdstitch: Run, folder: Path, arguments: list[str], status: int, *told
         ("calibrate a.png b.png -o camera.json --attitude-std -1", 2, "--attitude-std"),
         # Options that do not go together.
         (MOSAIC + "--all-blocks --strict", 2, "--strict"),
-        (MOSAIC + "--whole-layers", 2, "--layers"),
+        (MOSAIC + "--whole-layers", 2, "--whole-layers goes with --layers"),
+        (MOSAIC + "--idle 5", 2, "--idle goes with --follow"),
+        (MOSAIC + "--height 2", 2, "--height goes with --poses or --map-server"),
+        (MOSAIC + "--positions-offset 3", 2, "--positions-offset goes with --positions"),
+        ("trajectory a.png b.png -o path --attitude-std 2", 2, "--attitude-std goes with --attitude"),
+        (PANO + "--camera-format ros", 2, "--camera-format goes with --save-camera"),
         (PANO + "--projection sphere", 2, "--projection"),
         # Inputs that are none.
         ("mosaic a.png -o out.png", 2, "two different images"),

@@ -72,7 +72,7 @@ def test_the_first_image_is_the_frame_of_all_that_is_written(rdstitch: Run, fram
     of_sidecar = np.array([[0.42 * pose["x"], 0.42 * pose["y"], pose["yaw_deg"]] for pose in poses])
     np.testing.assert_allclose(of_sidecar, path, atol=1e-3)
     assert (of_sidecar[0] == 0.0).all()
-    refused = ("mosaic", *frames, "-o", tmp_path / "g.png", "--reference", frames[1].name, *known)
+    refused = ("mosaic", *frames, "-o", tmp_path / "g.png", "--reference", frames[1].name, *beside, *known)
     rdstitch(*refused, status=2, told="reference and frame first both name the reference")
 
 

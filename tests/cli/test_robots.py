@@ -275,6 +275,16 @@ def test_height_scales_positions_and_tum_has_eight_columns(rdstitch: Run, frames
     np.testing.assert_allclose(second[:, 4:], first[:, 4:], atol=1e-9)
 
 
+def test_the_name_of_a_path_says_its_format(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    arguments = ("trajectory", *frames, "--focal", "380", *CACHED)
+    for name, beginning in (("a.TUM", b"0.000000 0 0 1 "), ("a.bag", b"#ROSBAG V2.0"), ("a.txt", b"frame,name,")):
+        rdstitch(*arguments, "-o", tmp_path / name)
+        assert (tmp_path / name).read_bytes().startswith(beginning)
+    rdstitch(*arguments, "-o", tmp_path / "kitti.tum", "--format", "kitti")
+    assert np.loadtxt(tmp_path / "kitti.tum").shape == (3, 12)
+    rdstitch(*arguments, "-o", tmp_path / "a.svg", status=6, told="--plot")
+
+
 def test_writes_a_camera_that_pano_takes(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     file = tmp_path / "camera.json"
     done = rdstitch("calibrate", frames[0].parent, "-o", file, *CACHED)

@@ -61,6 +61,7 @@ def mosaic(
             "With --follow: seconds between updates of the preview, OUTPUT with .preview.jpg; 0: none.",
             "SECONDS",
             within=Range(least=0.0),
+            needs=("following",),
         ),
     ] = 5.0,
     preview: Preview = False,

@@ -31,11 +31,12 @@ def trajectory(
     file_format: Annotated[
         TrajectoryFormat,
         Option(
-            "csv: a table with names, time stamps, x, y, yaw_deg, height and their covariances. tum: time, position "
-            "and quaternion. kitti: matrices. bag: nav_msgs/Odometry on /odom, ROS 1 (.bag) or ROS 2 (a folder).",
+            "auto: by the name, .tum, .kitti or .bag, otherwise csv. csv: a table with names, time stamps, x, y, "
+            "yaw_deg, height and their covariances. tum: time, position and quaternion. kitti: matrices. bag: "
+            "nav_msgs/Odometry on /odom, ROS 1 (.bag) or ROS 2 (a folder).",
             flag="--format",
         ),
-    ] = "csv",
+    ] = "auto",
     frame: Annotated[
         TrajectoryFrame | None,
         Option(
@@ -58,10 +59,10 @@ def trajectory(
     metres when --height says how many those are; they are as good as the focal length (see --focal). With --follow,
     poses are printed as frames arrive.
     """
-    from rdstitch.export.trajectory_files import frame_of
+    from rdstitch.export.trajectory_files import format_of, frame_of
     from rdstitch.pipeline.recipes import trajectory as recipe
 
-    options = stitch_options(given)
+    options, file_format = stitch_options(given), format_of(output, file_format)
     how: dict[str, Any] = {"file_format": file_format, "plot": plot, "height": height, "frame": frame, "every": every}
     if following:
         from rdstitch.pipeline.live_source import follow_for_trajectory

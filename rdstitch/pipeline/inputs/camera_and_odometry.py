@@ -37,7 +37,7 @@ def read_camera(camera: Camera | str | Path, inputs: Sequence[Named] = ()) -> tu
     left = f"rms {read.fit.rms:.2f} pixels, at most {read.fit.largest:.2f} pixels"
     left += ", by which images are corrected" if read.camera.lens_model is not None else ""
     text = f"λ = {read.camera.nearest_distortion:.6f} was fitted to the {read.kind} lens model, {left}"
-    return read.camera, [Message(f"{file}: {text}")]
+    return read.camera, [Message(f"{file}: {text}", severity="note")]
 
 
 def _stored_size(file: str | Path, inputs: Sequence[Named]) -> tuple[int, int]:

@@ -21,6 +21,7 @@ from rdstitch.choices import CameraFormat, FocalSource
 from rdstitch.errors import ArgumentError, InputError, OutputError
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
+from rdstitch.pipeline.inputs.camera_and_odometry import read_camera
 from rdstitch.system.records import parse_yaml
 
 OPENCV = ["c.yml", "c.yaml", "opencv.json", "left.opencv.json", "a.fisheye.yml"]
@@ -534,6 +535,28 @@ def test_yaml_may_be_written_in_any_style(tmp_path: Path) -> None:
         "distortion_coefficients: {rows: 1, cols: 5, data: [-2e-1, 5.0e-02, 0, 0, 0]}\n"
     )
     assert load_camera(tmp_path / "block.yaml") == usual
+
+
+def test_images_of_a_region_of_interest_are_of_a_part_of_the_sensor(tmp_path: Path) -> None:
+    printed = (
+        "height: 480\nwidth: 640\ndistortion_model: plumb_bob\nd: [-0.2, 0.05, 0, 0, 0]\n"
+        "k: [400, 0, 319.5, 0, 400, 239.5, 0, 0, 1]\nroi: "
+    )
+    for roi in ("{x_offset: 0, y_offset: 0, width: 0, height: 0, do_rectify: false}", "[10, 10, 620, 460]"):
+        (tmp_path / "whole.yaml").write_text(printed + roi)
+        assert load_camera(tmp_path / "whole.yaml").image_size == (640, 480)
+    (tmp_path / "region.yaml").write_text(printed + "{x_offset: 200, y_offset: 60, width: 400, height: 300}")
+    whole, region = (load_camera(tmp_path / f"{name}.yaml") for name in ("whole", "region"))
+    assert region.image_size == (400, 300)
+    shown, offset = np.array([[0.0, 0.0], [399.0, 299.0], [50.0, 200.0]]), np.array([200.0, 60.0])
+    np.testing.assert_allclose(region.undistort(shown) + offset, whole.undistort(shown + offset), atol=1.0)
+
+
+def test_that_a_lens_was_fitted_is_no_warning(tmp_path: Path) -> None:
+    file = _opencv_file(tmp_path / "c.yml", (900.0, 900.0), [-0.2, 0.05, 0.0, 0.0, 0.0], (1280, 960))
+    (message,) = read_camera(file)[1]
+    assert "was fitted to the OpenCV lens model, rms 0." in message.text
+    assert message.severity == "note"
 
 
 def test_a_file_without_a_size_takes_that_of_the_images(tmp_path: Path) -> None:

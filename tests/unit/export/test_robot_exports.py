@@ -131,6 +131,16 @@ def test_a_bag_is_one_of_the_outputs(tmp_path: Path) -> None:
     assert [item.name for item in tmp_path.iterdir()] == ["odom"]
 
 
+@pytest.mark.parametrize("bag", ["odom", "odom.bag"])
+def test_a_bag_has_times_until_2038(tmp_path: Path, bag: str) -> None:
+    pytest.importorskip("rosbags")
+    for second in (2**31 - 1, -(2**31) + 1):
+        with Outputs(overwrite=True) as outputs:
+            write_trajectory(replace(PATH, timestamp=np.array([0.0, second])), tmp_path / bag, "bag", None, outputs)
+    with pytest.raises(OutputError, match=f"{bag}: a bag has no time of 5000000000 s"), Outputs(True) as outputs:
+        write_trajectory(replace(PATH, timestamp=np.array([0.0, 5e9])), tmp_path / bag, "bag", None, outputs)
+
+
 @pytest.mark.parametrize("error", [LimitError("large"), ArgumentError("wrong"), MemoryError()])
 def test_what_is_no_fault_of_the_bag_is_not_called_one(tmp_path: Path, error: Exception) -> None:
     pytest.importorskip("rosbags")

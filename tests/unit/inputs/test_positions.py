@@ -98,12 +98,22 @@ def test_json_with_groups_takes_the_value_with_a_sign(tmp_path: Path) -> None:
     assert place == GpsPosition(-33.9, 18.5)
 
 
-@pytest.mark.parametrize("head", ["name,x,y,z", "EPSG:32734"])
+@pytest.mark.parametrize(
+    "altitude",
+    ["430 m Below Sea Level,", "430 m,Below Sea Level", "430,1", "-430,1", "430,3", "430 m,Negative Sea Level (…)"],
+)
+def test_altitudes_below_the_sea(tmp_path: Path, altitude: str) -> None:
+    heading = "SourceFile,GPSLatitude,GPSLongitude,GPSAltitude,GPSAltitudeRef\n"
+    rows = f"a.jpg,31.5,35.5,{altitude}\nb.jpg,31.5,35.5,1,0\nc.jpg,31.5,35.5,3 m,Above Sea Level\n"
+    assert [place and place.altitude for place in _read(tmp_path, heading + rows)] == [-430.0, 1.0, 3.0]
+
+
+@pytest.mark.parametrize("head", ["name,x,y,z", "EPSG:32734", "epsg:32734+5773"])
 def test_projected_coordinates(tmp_path: Path, head: str) -> None:
     rows = ["a.jpg,268832.2996,6246117.7881,12", "b.jpg,268932.2996,6246117.7881,12"]
-    if head.startswith("EPSG"):
+    if named := head.lower().startswith("epsg"):
         rows = [row.replace(",", " ") for row in rows]
-    one, two, _ = _read(tmp_path, "\n".join([head, *rows]), None if head.startswith("EPSG") else 32734)
+    one, two, _ = _read(tmp_path, "\n".join([head, *rows]), None if named else 32734)
     assert (one.latitude, one.longitude, one.altitude) == pytest.approx((-33.9, 18.5, 12.0), abs=1e-7)
     np.testing.assert_allclose(Crs(32734).project([two.latitude], [two.longitude])[0, 0], 268932.2996, atol=1e-3)
 
@@ -149,6 +159,10 @@ def test_images_have_their_places_on_a_track_by_their_times(tmp_path: Path) -> N
     ("text", "message"),
     [
         ("", "names no columns like name,latitude,longitude or name,x,y"),
+        (
+            "ETRS89 / UTM 32N\na.jpg 5e5 5e6\n",
+            "names no columns like name,latitude,longitude or name,x,y: 'ETRS89 / UTM",
+        ),
         ("name,lat,lon\n", "has no rows below its heading"),
         ("name,lat,lon\nz.jpg,1,2\n", "has no position of a.jpg"),
         ("name,lat,lon\na.jpg,1,2\na.jpg,1,2\n", "line 3: a.jpg is here twice"),

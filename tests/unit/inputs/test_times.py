@@ -1,11 +1,14 @@
 """Times belong to what was named, whatever of it is left out."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from rdstitch.errors import InputError
+from rdstitch.inputs.attitudes import with_attitudes
 from rdstitch.inputs.frame import Frame
+from rdstitch.inputs.odometry import read_odometry
 from rdstitch.inputs.times import with_times
 
 
@@ -51,3 +54,20 @@ def test_a_list_has_one_time_of_each_name(tmp_path: Path) -> None:
     file.write_text("1.5 a.png\n2.5 a.png\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"line 2: a\.png is here twice"):
         with_times([Frame(Path("a.png"))], file)
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e9])
+def test_times_in_smaller_units_are_not_taken_for_seconds(tmp_path: Path, unit: float) -> None:
+    file, moments = tmp_path / "times.txt", [f"{(1.7e9 + k) * unit:.0f}" for k in range(2)]
+
+    def refused(read: Callable[[], object], text: str) -> None:
+        file.write_text(text.format(*moments), encoding="utf-8")
+        with pytest.raises(InputError, match=rf"{moments[0]}; is it in nanoseconds\?"):
+            read()
+
+    frames = [Frame(Path(f"{name}.png")) for name in "ab"]
+    for text in ("{}\n{}\n", "{} a.png\n{} b.png\n", "timestamp,name\n{},a.png\n{},b.png\n"):
+        refused(lambda: with_times(frames, file), text)
+    for text in ("{} 0 0 0 0 0 0 1\n{} 1 0 0 0 0 0 1\n", "timestamp,x,y,yaw\n{},0,0,0\n{},1,0,0\n"):
+        refused(lambda: read_odometry(file), text)
+    refused(lambda: with_attitudes([], file), "timestamp,psi,theta\n{},0,0\n{},1,0\n")

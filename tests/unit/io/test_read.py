@@ -163,6 +163,13 @@ class TestMetadata:
         Image.new("L", (width, width * 3 // 4)).save(tmp_path / "a.jpg", exif=exif, **told)
         assert read_metadata(tmp_path / "a.jpg").focal_px == pytest.approx(focal)
 
+    @pytest.mark.parametrize(("reference", "sign"), [(b"\0", 1), (b"\1", -1), (b"\2", 1), (b"\3", -1)])
+    def test_altitudes_below_the_sea(self, tmp_path: Path, reference: bytes, sign: int) -> None:
+        exif = Image.Exif()
+        exif[0x8825] = {1: "N", 2: (31.0, 30.0, 0.0), 3: "E", 4: (35.0, 30.0, 0.0), 5: reference, 6: 430.0}
+        Image.new("L", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
+        assert read_metadata(tmp_path / "a.jpg").gps.altitude == sign * 430.0
+
     def test_place_and_attitude(self, tmp_path: Path) -> None:
         exif = Image.Exif()
         exif[0x010F], exif[0x0110] = "Maker", "Model"

@@ -161,6 +161,9 @@ def test_a_table_in_micrometres_needs_the_size_of_a_pixel(tmp_path: Path) -> Non
         grid_from_table(["a.tif", "b.tif"], table, SIZE, None)
     with pytest.raises(InputError, match=r"has no line for c\.tif"):
         grid_from_table(["c.tif"], table, SIZE, 0.5)
+    table.write_text("name,x (mm),y (mm)\na.tif,0,0\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"'x \(mm\)' has a unit that is not known here; give it in px or um"):
+        grid_from_table(["a.tif"], table, SIZE, 0.5)
 
 
 def test_ome_tiff_says_where_it_was_taken(tmp_path: Path) -> None:
