@@ -79,6 +79,7 @@ def stage_layers(result: OutputImage, files: Mapping[str, tuple[Path, Path]], ou
     task = decide(images, result.canvas, replace(result.options.composite, crop="none"))
     with prepare_composite(task) as tiles:
         canvas = tiles.box
+        metadata = result.placed.profile_source.metadata.with_samples(tiles.renderer.channels)
         for index, (source, warp) in enumerate(zip(result.placed.sources, tiles.renderer.warps, strict=True)):
             box = canvas if whole else intersection(warp.box, canvas) or canvas
             samples, covered, mask = tiles.renderer.layer(index, box)
@@ -93,12 +94,14 @@ def stage_layers(result: OutputImage, files: Mapping[str, tuple[Path, Path]], ou
             tags += [] if result.georeference is None else result.georeference.after(shift).tiff_tags()
             layer, mask_file = files[source.name]
             with outputs.writing(layer) as staged:
-                _write_tiff(staged, samples, as_alpha(covered), tags)
+                _write_tiff(staged, samples, as_alpha(covered), tags, metadata.icc_profile)
             with outputs.writing(mask_file) as staged:
-                _write_tiff(staged, as_alpha(mask)[..., None], None, tags)
+                _write_tiff(staged, as_alpha(mask)[..., None], None, tags, b"")
 
 
-def _write_tiff(path: Path, samples: AnyArray, alpha: UInt8Array | None, tags: Sequence[ExtraTag]) -> None:
+def _write_tiff(
+    path: Path, samples: AnyArray, alpha: UInt8Array | None, tags: Sequence[ExtraTag], profile: bytes
+) -> None:
     """Write samples (h, w, C), and alpha (h, w), which is 0 or 255."""
     colours = 3 if samples.shape[2] == 3 else 1
     extra = ["unspecified"] * (samples.shape[2] - colours)
@@ -114,6 +117,7 @@ def _write_tiff(path: Path, samples: AnyArray, alpha: UInt8Array | None, tags: S
         predictor=samples.dtype.kind == "u",
         resolution=(_DPI, _DPI),
         resolutionunit="inch",
+        iccprofile=profile or None,
         extratags=tags,
         metadata=None,
         software=False,

@@ -97,9 +97,21 @@ class Metadata:
         """Its dpi where files can say that; None elsewhere."""
         return self.dpi if self.dpi is not None and all(0.0 < each < _MAX_DPI for each in self.dpi) else None
 
+    def with_samples(self, channels: int) -> Self:
+        """Metadata of an image of so many channels; a colour profile of grey samples is none of colours."""
+        grey = self.icc_profile[_COLOUR_SPACE] == b"GRAY"
+        return replace(self, icc_profile=b"") if grey and channels > 1 else self
+
     def in_another_size(self) -> Self:
         """Metadata of the same image at the same scale but cut or extended."""
         return replace(self, exif=without_film_size(self.exif))
+
+    def scaled(self, scale: float | None) -> Self:
+        """Metadata of an image of so many pixels for one; None where that is not known."""
+        if scale is None:
+            return replace(self, dpi=None, pixel_size=None)
+        dpi = None if self.dpi is None else (self.dpi[0] * scale, self.dpi[1] * scale)
+        return replace(self, dpi=dpi, pixel_size=None if self.pixel_size is None else self.pixel_size / scale)
 
     def of_composite(self) -> Self:
         """Metadata of an image made from several."""

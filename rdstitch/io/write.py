@@ -7,6 +7,7 @@ WebP. The same image gives the same bytes either way.
 import io
 import os
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -90,6 +91,7 @@ def write_strips(
     file = Path(path)
     check_format(file, spec)
     checked, tiles, messages = check_strips(spec, strips), None, list[Message]()
+    spec = replace(spec, metadata=spec.metadata.with_samples(3 if file.suffix.lower() == ".webp" else spec.channels))
     with Outputs.or_own(outputs) as staging:
         check = partial(check_folder, overwrite=True)
         if file.suffix.lower() == ".dzi":

@@ -76,6 +76,11 @@ class PlacedImages:
             ),
         )
 
+    @property
+    def profile_source(self) -> Source:
+        """The image whose colour profile the output has: the first in colours, where any is."""
+        return next((source for source in self.sources if source.metadata.channels > 2), self.sources[0])
+
     @cached_property
     def cameras(self) -> list[Camera]:
         """Those of the images."""

@@ -1,6 +1,7 @@
 """Options of compositing on the command line, for real: layers too."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -105,6 +106,40 @@ def test_tags_are_kept_and_upright(
     assert (turned_output.metadata.icc_profile, turned_output.metadata.make) == (profile, "Maker")
     with Image.open(tmp_path / f"turned.{suffix}") as written:
         assert written.getexif().get(ExifTags.Base.Orientation, 1) == 1
+
+
+def _saved(frames: list[Path], folder: Path, modes: str, **tags: Any) -> list[Path]:
+    """Copies, grey where their letter is L, with a profile of such samples."""
+    files = [folder / f"{frame.stem}.tif" for frame in frames]
+    folder.mkdir()
+    for frame, file, mode in zip(frames, files, modes, strict=True):
+        profile = bytes(16) + {"L": b"GRAY", "C": b"RGB "}[mode] + bytes(200)
+        with Image.open(frame) as image:
+            (image.convert("L") if mode == "L" else image).save(file, icc_profile=profile, **tags)
+    return files
+
+
+@pytest.mark.parametrize(("modes", "suffix", "kept"), [("CCC", "png", b"RGB "), ("LCC", "jpg", b"RGB "),
+                         ("LLL", "tif", b"GRAY"), ("LLL", "webp", b"")])  # fmt: skip
+def test_profile_is_one_of_the_samples_and_in_the_layers_too(
+    rdstitch: Run, frames: list[Path], tmp_path: Path, modes: str, suffix: str, kept: bytes
+) -> None:
+    files, output, layers = _saved(frames, tmp_path / "in", modes), tmp_path / f"out.{suffix}", tmp_path / "layers"
+    done = rdstitch("mosaic", tmp_path / "in", "-o", output, "--layers", layers, *CACHED)
+    assert ("one of grey samples, and WebP has colours" in done.err) == (suffix == "webp")
+    assert ("another colour profile than" in done.err) == (modes == "LCC")
+    assert read_image(output).metadata.icc_profile[16:20] == kept
+    in_layer = b"GRAY" if modes == "LLL" else b"RGB "
+    assert {read_image(layers / file.name).metadata.icc_profile[16:20] for file in files} == {in_layer}
+    assert read_image(layers / f"{files[0].stem}_mask.tif").metadata.icc_profile == b""
+
+
+def test_dots_per_inch_are_scaled(rdstitch: Run, sidecar: Path, frames: list[Path], tmp_path: Path) -> None:
+    _saved(frames, tmp_path / "in", "CCC", dpi=(300.0, 300.0))
+    output, expected = tmp_path / "out.tif", {("--scale", "0.5"): (150.0, 150.0), ("--max-size", "300"): None}
+    for option, dpi in expected.items():
+        rdstitch("apply", sidecar, "--images", tmp_path / "in", "-o", output, *option, "--overwrite")
+        assert read_image(output).metadata.dpi == dpi
 
 
 @pytest.mark.parametrize("whole", [False, True])

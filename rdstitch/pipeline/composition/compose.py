@@ -22,7 +22,6 @@ from rdstitch.compositing.boxes import Box
 from rdstitch.compositing.tiles import BlockRunner
 from rdstitch.georeferencing.georeference import Georeference, world_file_paths
 from rdstitch.georeferencing.place_on_map import MapPlacement
-from rdstitch.inputs.source import Source
 from rdstitch.io.formats import check_memory, check_size
 from rdstitch.io.metadata import Metadata
 from rdstitch.io.tiff import ExtraTag
@@ -93,8 +92,8 @@ def compose_images(
 ) -> tuple[OutputImage, list[Message]]:
     """Compose images on their canvas, in memory or into a file, or plan that in a dry run; with messages.
 
-    A file has colour profile and EXIF of the first image, and its place on the Earth. ``run_blocks``: see
-    :func:`rdstitch.compositing.compose_decided`.
+    A file has EXIF of the first image, the colour profile of the first in colours, and its place on the Earth.
+    ``run_blocks``: see :func:`rdstitch.compositing.compose_decided`.
     """
     return_freed_memory()
     options, output = layout.options, run.output
@@ -125,7 +124,7 @@ def _drawn(
     laid_out: OutputImage, layout: CanvasLayout, decisions: Decisions, run: Run, run_blocks: BlockRunner | None
 ) -> tuple[OutputImage, list[Message]]:
     """Draw the image, in memory or into a file with its world files."""
-    outputs, output, sources = run.outputs, run.output, layout.placed.sources
+    outputs, output, placed = run.outputs, run.output, layout.placed
 
     def report(fraction: float) -> None:
         run.progress("compositing", round(100 * fraction), 100)
@@ -138,23 +137,24 @@ def _drawn(
         image = compose_decided(decisions, report, run_blocks)
         place = layout.place_of(image.canvas)
         return replace(laid_out, composite=image, canvas=image.canvas, georeference=place), [*image.messages]
-    metadata = _metadata(sources[0], layout.options)
+    metadata = _metadata(placed, layout.options)
     written = compose_to_file(
         output, decisions, report, run_blocks, metadata=metadata, extra_tags=tags, outputs=outputs
     )
     place = layout.place_of(written.canvas)
-    messages = [*written.messages, *lost_profile_messages(sources[0], output), *differing_profile_messages(sources)]
+    lost = lost_profile_messages(placed.profile_source, output)
+    messages = [*written.messages, *lost, *differing_profile_messages(placed)]
     if place is not None and (files := world_file_paths(output)):
         messages += outputs.attempt(files[0], partial(_write_world_files, outputs, files, place))
     return replace(laid_out, written=written, canvas=written.canvas, georeference=place), messages
 
 
-def _metadata(source: Source, options: CompositeOptions) -> Metadata:
-    """Metadata of the output: that of the first image, with the pixel size as scaled."""
-    metadata = source.metadata.of_composite()
-    if metadata.pixel_size is None:
-        return metadata
-    return replace(metadata, pixel_size=None if options.max_size is not None else metadata.pixel_size / options.scale)
+def _metadata(placed: PlacedImages, options: CompositeOptions) -> Metadata:
+    """Metadata of the output: that of the first image, with pixel size and resolution as scaled."""
+    metadata = placed.sources[0].metadata.of_composite()
+    metadata = replace(metadata, icc_profile=placed.profile_source.metadata.icc_profile)
+    sized = (options.max_size, options.gsd, options.like) != (None, None, None)
+    return metadata.scaled(None if sized else options.scale)
 
 
 def _box_of_rectangle(placed: PlacedImages, corners: Corners, canvas: Canvas) -> Box | None:

@@ -96,16 +96,19 @@ def lost_profile_messages(source: Source, output: Path) -> list[Message]:
     lost, size = source.metadata.profile_lost, len(source.metadata.icc_profile)
     if output.suffix.lower() == ".dzi" and size > MAX_TILE_PROFILE:
         lost = f"its colour profile of {size / 1e3:.0f} kB is too large to be in every tile"
+    elif output.suffix.lower() == ".webp" and size > len(source.metadata.with_samples(3).icc_profile):
+        lost = "its colour profile is one of grey samples, and WebP has colours"
     return [Message(f"{lost}; colours are as if it had none", (str(source.path),))] if lost else []
 
 
-def differing_profile_messages(sources: Sequence[Source]) -> list[Message]:
-    """Which images have other colours than those of the output, whose profile is the first image's."""
-    spaces = [colour_space(source.metadata.icc_profile) for source in sources]
-    others = [str(source.path) for source, space in zip(sources, spaces, strict=True) if space != spaces[0]]
+def differing_profile_messages(placed: PlacedImages) -> list[Message]:
+    """Which images have other colours than those of the output."""
+    first = placed.profile_source
+    spaces = [(str(source.path), colour_space(source.metadata.icc_profile)) for source in placed.sources]
+    others = [path for path, space in spaces if space != colour_space(first.metadata.icc_profile)]
     if not others:
         return []
-    what = f"another colour profile than {sources[0].name}, whose the output has"
+    what = f"another colour profile than {first.name}, whose the output has"
     who = "has" if len(others) == 1 else f"{len(others)} of the images ({shortened(names_of(others))}) have"
     text = f"{who} {what}: their colours are off; convert them to one colour space first"
     return [Message(text, tuple(others), code="colour-profiles")]
