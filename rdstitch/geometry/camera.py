@@ -79,6 +79,14 @@ def _real_numbers(name: str, value: Any, shape: tuple[int, ...]) -> Any:
     return tuple(_real_numbers(name, row, shape[1:]) for row in rows)
 
 
+def _pairs(points: ArrayLike) -> FloatArray:
+    """Points as an array of pairs of coordinates."""
+    array = np.asarray(points, dtype=np.float64)
+    if array.shape[-1:] != (2,):
+        raise ArgumentError(f"points must be an array of shape (..., 2), not {array.shape}")
+    return array
+
+
 def is_focal_length(focal: float, image_size: tuple[int, int]) -> bool:
     """Check whether a number can be a focal length, pixels, of images of a size; damaged files hold others."""
     low, high = _FOCAL_LIMITS
@@ -337,11 +345,11 @@ class Camera:
 
     def normalize(self, points: ArrayLike) -> FloatArray:
         """Pixels (..., 2) to normalized points, from the centre in units of :attr:`scale`."""
-        return (np.asarray(points, dtype=np.float64) - self.center) / self.scale
+        return (_pairs(points) - self.center) / self.scale
 
     def denormalize(self, points: ArrayLike) -> FloatArray:
         """Normalized points (..., 2), from the centre in units of :attr:`scale`, to pixels."""
-        return np.asarray(points, dtype=np.float64) * self.scale + self.center
+        return _pairs(points) * self.scale + self.center
 
     def undistort(self, points: ArrayLike) -> FloatArray:
         """Measured pixels (..., 2) to the pixels of a lens without distortion; NaN outside the model's domain."""
@@ -366,7 +374,7 @@ class Camera:
 
     def resized(self, image_size: tuple[int, int]) -> Self:
         """The same lens on an image of another size: λ stays, centre and focal length scale."""
-        if image_size == self.image_size:
+        if tuple(image_size) == self.image_size:
             return self
         factor = math.hypot(*image_size) / math.hypot(*self.image_size)
         offset = [(c - (n - 1) / 2) * factor for c, n in zip(self.center, self.image_size, strict=True)]

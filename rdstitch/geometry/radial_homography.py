@@ -235,9 +235,9 @@ class RadialHomography:
         Why this model was chosen, or why the fit failed.
     ok : bool
     parameters : tuple of str
-        "distortion", then the free parameters of the model: "psi" and "theta" of the tilt and "yaw", radians, "tx" and
-        "ty" in heights, "log_height" of the change of height, "log_focal"; or "tangent_1" to "tangent_8", orthonormal
-        directions that change a homography of unit norm.
+        "distortion", if λ was estimated and is observable, then the free parameters of the model: "psi" and "theta" of
+        the tilt and "yaw", radians, "tx" and "ty" in heights, "log_height" of the change of height, "log_focal"; or
+        "tangent_1" to "tangent_8", orthonormal directions that change a homography of unit norm.
     """
 
     homography: FloatArray

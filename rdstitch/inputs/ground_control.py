@@ -1,7 +1,7 @@
 """Ground control points, by OpenDroneMap's list or a table."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -22,6 +22,7 @@ from rdstitch.inputs.positions import (
 from rdstitch.inputs.rows_of_images import ImagesByName
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import Row, csv_rows, is_table, numbered_lines, numbers_before, rows_of
+from rdstitch.results.messages import Message, ignored, shortened
 from rdstitch.system.file_access import read_text
 
 _ACCURACIES = {name: aliases for name, aliases in COLUMNS.items() if name.endswith("std")}
@@ -41,13 +42,18 @@ _CONTROL_LISTED = ("x", "y", "z", "px", "py", "name")
 
 
 def with_ground_control(
-    sources: Sequence[Source], file: str | Path | None, epsg: int | None = None, *, check: bool = False
+    sources: Sequence[Source],
+    file: str | Path | None,
+    epsg: int | None = None,
+    *,
+    check: bool = False,
+    report: Callable[[Message], None] = ignored,
 ) -> list[Source]:
     """The sources with the ground control points that they show by a list, if there is one.
 
     Its first line names the coordinate system, else it is ``epsg``; then lines as OpenDroneMap's, ``X Y Z PX PY IMAGE
     [NAME]``, or CSV with a header: pixels of the upright image, the centre of the top-left one at (0, 0). Points to
-    ``check`` come besides those that the sources have.
+    ``check`` come besides those that the sources have. Lines of other images are reported.
     """
     if file is None:
         return list(sources)
@@ -61,9 +67,12 @@ def with_ground_control(
         )
     else:
         rows = _opendronemap(body, str(file))
-    marks = _marks(rows, sources)
+    marks, of_others = _marks(rows, sources)
     if not marks:
         raise InputError(f"{file}: has no ground control point in any of the images")
+    if of_others:
+        text = f"{file}: {len(of_others)} of {len(rows)} lines are of none of the images ({shortened(of_others)})"
+        report(Message(text, severity="note"))
     places = [GpsPosition(*degrees) for degrees in geographic_places([mark.place for mark in marks], str(file), system)]
     metres = metres_around_median(places).tolist()
     contradiction = contradicting_places([mark.point for mark in marks], metres, [mark.std for mark in marks])
@@ -91,10 +100,13 @@ class _Mark(NamedTuple):
     std: float | None  # of a coordinate of the place, m
 
 
-def _marks(rows: Iterable[Row], sources: Sequence[Source]) -> list[_Mark]:
-    marks, names = [], ImagesByName(sources)
+def _marks(rows: Sequence[Row], sources: Sequence[Source]) -> tuple[list[_Mark], list[str]]:
+    """The marks in the images, and the names in rows of other images."""
+    marks, of_others, names = list[_Mark](), list[str](), ImagesByName(sources)
     for row in rows:
         images, point = _images_and_point(row, names)
+        if not images:
+            of_others.append(row.image)
         for image in images:
             pixel, place = (row.needed("px"), row.needed("py")), coordinates_of(row)
             if place is None:
@@ -106,7 +118,7 @@ def _marks(rows: Iterable[Row], sources: Sequence[Source]) -> list[_Mark]:
             accuracy = accuracy_of(row)
             named = point or f"{place.x:.12g} {place.y:.12g}"
             marks.append(_Mark(image, named, place, pixel, accuracy and accuracy[0]))
-    return marks
+    return marks, of_others
 
 
 def _is_listed(line: str) -> bool:

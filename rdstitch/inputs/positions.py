@@ -12,7 +12,7 @@ a coordinate system, then lines   OpenDroneMap's ``geo.txt``: NAME X Y [Z … HO
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -29,6 +29,7 @@ from rdstitch.inputs.rows_of_images import RowsByImage
 from rdstitch.inputs.source import Source
 from rdstitch.inputs.tables import NUMERAL, Row, csv_rows, is_table, json_rows, numbered_lines, numbers_before, rows_of
 from rdstitch.inputs.tracks import by_events, is_list_of_events, on_track, subtitle_points, track_points
+from rdstitch.results.messages import Message, ignored, shortened
 from rdstitch.system.file_access import read_text
 
 COLUMNS = {
@@ -85,18 +86,25 @@ def with_positions(
     epsg: int | None = None,
     offset: float = 0.0,
     accuracy: float | None = None,
+    report: Callable[[Message], None] = ignored,
 ) -> list[Source]:
     """The sources with the positions of a file, if there is one, instead of those of EXIF.
 
     ``epsg`` is the coordinate system of x and y where the file names none; ``offset``, s, is added to the times of the
     images to find them on a track. ``accuracy`` is the standard deviation of a horizontal coordinate, m, where they
-    have none of their own; heights are half as accurate.
+    have none of their own; heights are half as accurate. That the file lacks images is reported.
     """
-    places = [source.metadata.gps for source in sources] if file is None else _places(sources, file, epsg, offset)
-    for place in places if file is not None else ():
-        if place is not None and not (abs(place.latitude) <= 90.0 and abs(place.longitude) <= 180.0):
-            degrees = f"{place.latitude:g} and {place.longitude:g}"
-            raise InputError(f"{file}: expected latitude and longitude in degrees, not {degrees}")
+    if file is None:
+        places = [source.metadata.gps for source in sources]
+    else:
+        places = _places(sources, file, epsg, offset)
+        for place in filter(None, places):
+            if not (abs(place.latitude) <= 90.0 and abs(place.longitude) <= 180.0):
+                degrees = f"{place.latitude:g} and {place.longitude:g}"
+                raise InputError(f"{file}: expected latitude and longitude in degrees, not {degrees}")
+        if lacking := [source.name for source, place in zip(sources, places, strict=True) if place is None]:
+            text = f"{file}: has no position of {len(lacking)} of {len(sources)} images ({shortened(lacking)})"
+            report(Message(text, severity="note"))
     if accuracy is not None:
         std = (accuracy, 2.0 * accuracy)
         places = [place and (replace(place, std=std) if place.std is None else place) for place in places]

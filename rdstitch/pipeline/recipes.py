@@ -34,7 +34,7 @@ from rdstitch.pipeline.registration.register import register
 from rdstitch.pipeline.registration.working_size import at_full_size
 from rdstitch.pipeline.run import RecipeInput, Run
 from rdstitch.pipeline.run_on_sources import blocks_on
-from rdstitch.results.messages import Message, merge_by_reason
+from rdstitch.results.messages import Message, merge_by_reason, of_severity
 from rdstitch.results.registration import Registration
 from rdstitch.results.stitch_result import StitchResult
 from rdstitch.system.native_threads import one_native_thread
@@ -147,12 +147,12 @@ def stitch_images(
     names = [frame.name for frame in selected(frames, options.exclude, options.include_only)]
     files = OutputFiles.of_images(run, images.files, names, more_images, more_files)
     files.check()
-    sources, unread = read_inputs(frames, options, run.guard, skip_bad=run.purpose is not Purpose.PANO)
+    sources, of_inputs = read_inputs(frames, options, run.guard, skip_bad=run.purpose is not Purpose.PANO)
     files.check_places(sources)
     check_map(sources, options.composite)
     with run.executor(len(sources)) as executor:
-        with _failures_explained(run, unread):
-            accepted, run = _register_and_check(sources, [*unread, *images.messages], run, executor)
+        with _failures_explained(run, of_inputs):
+            accepted, run = _register_and_check(sources, [*of_inputs, *images.messages], run, executor)
             run.progress("laying out", 0, 1)
             chosen = choose_layout(accepted, run.options, aligner_of(accepted, run))
         return compose_registration(chosen, run, files, executor)
@@ -255,19 +255,20 @@ def trajectory(
 def _register_at_full_size(images: FoundImages, run: Run) -> Registration:
     """Register images, in pixels of their full size."""
     frames = with_times(images.frames, run.options.timestamps)
-    sources, unread = read_inputs(frames, run.options, run.guard, skip_bad=True)
-    with run.executor(len(sources)) as executor, _failures_explained(run, unread):
-        accepted, _ = _register_and_check(sources, [*unread, *images.messages], run, executor)
+    sources, of_inputs = read_inputs(frames, run.options, run.guard, skip_bad=True)
+    with run.executor(len(sources)) as executor, _failures_explained(run, of_inputs):
+        accepted, _ = _register_and_check(sources, [*of_inputs, *images.messages], run, executor)
     return _release_images(at_full_size(accepted), run)
 
 
 @contextmanager
-def _failures_explained(run: Run, unread: Sequence[Message]) -> Iterator[None]:
+def _failures_explained(run: Run, of_inputs: Sequence[Message]) -> Iterator[None]:
     """Add unreadable and damaged images to the text of a failure in the block; write the report of a refused result."""
     try:
         yield
     except RegistrationError as error:
-        reasons = [str(replace(message, code="")) for message in merge_by_reason([*unread, *run.guard.warnings])]
+        left_out = of_severity(of_inputs, "left out")
+        reasons = [str(replace(message, code="")) for message in merge_by_reason([*left_out, *run.guard.warnings])]
         error.args = ("; ".join([str(error), *reasons]),)
         if isinstance(error, RefusedError):
             report_refused(run, error.registration)

@@ -162,7 +162,7 @@ def estimate_radial_homography(
     (True, 'rigid')
     """
     camera1 = Camera(image_size, focal=focal, focal_source=None if focal is None else focal_source or "option")
-    size2 = image_size2 or image_size
+    size2 = image_size if image_size2 is None else image_size2
     if center is not None:
         if (image_size[0] - image_size[1]) * (size2[0] - size2[1]) < 0:
             raise ArgumentError(
@@ -276,7 +276,7 @@ def _result(
         camera2=camera2,
         inliers=inliers,
         covariance=fit.covariance,
-        parameters=("distortion", *fit.model.parameters),
+        parameters=("distortion", *fit.model.parameters)[-len(fit.covariance) :],
         distortion_std=fit.distortion_std,
         model=fit.model.name,
         motion=fit.model.motion(fit.state),

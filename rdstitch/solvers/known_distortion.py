@@ -58,9 +58,9 @@ def four_point_dlt(x1: ArrayLike, x2: ArrayLike, distortion: ArrayLike) -> Solut
 
     def solve(points: FloatArray, samples: IndexArray) -> Solutions:
         given = lam[samples]
-        low, _ = lens_range(points, (-np.inf, np.inf))
+        low, high = lens_range(points, (-np.inf, np.inf))
         h, possible = Quadrangles.of(points).homography(given)
-        index = np.flatnonzero(possible & (given > low))
+        index = np.flatnonzero(possible & (given > low) & (given < high))
         return Solutions(index, h[index], given[index])
 
     return solve_in_blocks(solve, x1, x2, 4)

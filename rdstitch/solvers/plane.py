@@ -81,8 +81,8 @@ def visible_range(
 ) -> tuple[FloatArray, FloatArray]:
     """The λ for which all points lie within the lens model and in front of the camera, and no two coincide.
 
-    Of points and their :func:`depths` (2, 2, k, b): ``1 + λ r²`` and the depth of each point are linear in λ, so that
-    each leaves a half-line. Of a degenerate sample the range (b,) is empty, ``low > high``.
+    Of points and their :func:`depths` (2, 2, k, b). Within the lens model ``|λ| r² < 1``, and each depth is linear in
+    λ, so that it leaves a half-line. Of a degenerate sample the range (b,) is empty, ``low > high``.
     """
     low, high = lens_range(points, distortion_range)
     constant, slope = depth
@@ -100,7 +100,7 @@ def lens_range(points: FloatArray, distortion_range: tuple[float, float]) -> tup
     first, second = np.triu_indices(points.shape[2], 1)
     nearest2 = squared_radii(np.take(points, first, axis=2) - np.take(points, second, axis=2)).min(axis=(0, 1))
     lows[~(nearest2 > _MIN_SEPARATION**2 * radius2)] = np.inf
-    return lows, np.full_like(lows, high)
+    return lows, np.minimum(high, (1.0 - _MIN_DEPTH) / np.maximum(radius2, 1e-300))
 
 
 def plane_points(points: FloatArray, rotations: TiltRotations, distortion: FloatArray) -> FloatArray:

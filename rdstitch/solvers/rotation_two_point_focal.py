@@ -46,7 +46,8 @@ def rotation_two_point_focal(
 
     def solve(points: FloatArray, samples: IndexArray) -> Solutions:
         lam = known[samples]
-        inside = np.flatnonzero(lam > lens_range(points, (-np.inf, np.inf))[0])
+        least, most = lens_range(points, (-np.inf, np.inf))
+        inside = np.flatnonzero((lam > least) & (lam < most))
         points, lam = np.take(points, inside, axis=-1), lam[inside]
         pairs = RayPairs.between(points[:, :, :1], points[:, :, 1:])
         ends = (np.full(len(lam), f * f / (1.0 + f * f)) for f in (low, high))

@@ -53,7 +53,8 @@ def parse_yaml(text: str, file: str) -> Any:
         def flatten_mapping(self, node: Any) -> None:
             pass
 
-    Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", yaml.SafeLoader.construct_yaml_map)  # type: ignore[type-var]
+    for kind in ("opencv-matrix", "opencv-nd-matrix"):
+        Loader.add_constructor(f"tag:yaml.org,2002:{kind}", yaml.SafeLoader.construct_yaml_map)  # type: ignore[type-var]
     if len(text) > _MAX_YAML:
         raise InputError(f"{file}: is too large for a camera file")
     try:

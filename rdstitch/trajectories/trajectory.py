@@ -122,7 +122,9 @@ class Trajectory:
         first_moves[:, :2, 3] = np.stack([-path.position[:, 1], path.position[:, 0]], axis=1)
         mixed = change @ both @ first_moves.transpose(0, 2, 1)
         moved = first_moves @ one[0] @ first_moves.transpose(0, 2, 1)
-        return replace(path, covariance=change @ one @ change.T + mixed + mixed.transpose(0, 2, 1) + moved)
+        covariance = change @ one @ change.T + mixed + mixed.transpose(0, 2, 1) + moved
+        covariance[0] = 0.0  # exactly, which a difference of equal terms is not
+        return replace(path, covariance=covariance)
 
     @classmethod
     def on_map(cls, poses: PlanarPoses, to_map: FloatArray, map_scale: float = 1.0) -> Self:

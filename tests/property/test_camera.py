@@ -72,6 +72,16 @@ def test_a_resized_image_shows_the_same_rays() -> None:
     assert small.distortion == camera.distortion
 
 
+def test_sizes_may_be_arrays_and_points_are_pairs() -> None:
+    camera = Camera((800, 600), -0.3)
+    same, smaller = (camera.resized(np.array(size)) for size in ((800, 600), (400, 300)))  # type: ignore[arg-type]
+    assert (same, smaller.image_size) == (camera, (400, 300))
+    for points in (5.0, [[1.0], [2.0]], np.zeros((4, 3)), np.zeros((2, 7))):
+        for convert in (camera.undistort, camera.distort, camera.normalize, camera.denormalize):
+            with pytest.raises(ArgumentError, match=r"points must be an array of shape \(\.\.\., 2\), not"):
+                convert(points)
+
+
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_camera_turns_with_its_image(orientation: int) -> None:
     camera = Camera((800, 600), -0.3, center=(410.0, 290.0), tilt=(0.1, -0.05), tilt_std=(0.01, 0.02))

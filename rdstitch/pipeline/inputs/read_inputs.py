@@ -43,7 +43,7 @@ def read_frames(
 def read_inputs(
     frames: Sequence[Frame], options: StitchOptions, guard: InputGuard, *, skip_bad: bool
 ) -> tuple[list[Source], list[Message]]:
-    """Read the selected images with all measurements; with messages on those that cannot be read."""
+    """Read the selected images with all measurements; with messages on those that cannot be read or have none."""
     # Before the first large image is freed.
     return_freed_memory()
     chosen = selected(frames, options.exclude, options.include_only)
@@ -59,8 +59,9 @@ def read_inputs(
         twice = f"{chosen[0].path} is named twice: " if len(chosen) > 1 else ""
         raise ArgumentError(f"{twice}stitching needs two different images or more; name at least one more")
     sources = with_attitudes(with_masks(sources, options.mask), options.attitude)
-    epsg = options.composite.epsg
-    sources = with_positions(sources, options.positions, epsg, options.positions_offset, options.position_accuracy)
+    epsg, offset, accuracy = options.composite.epsg, options.positions_offset, options.position_accuracy
+    notes = list[Message]()
+    sources = with_positions(sources, options.positions, epsg, offset, accuracy, notes.append)
     for points, check in ((options.gcp, False), (options.check_points, True)):
-        sources = with_ground_control(sources, points, epsg, check=check)
-    return (sources if options.scheduler is None else [s.with_absolute_paths() for s in sources]), unread
+        sources = with_ground_control(sources, points, epsg, check=check, report=notes.append)
+    return (sources if options.scheduler is None else [s.with_absolute_paths() for s in sources]), [*unread, *notes]

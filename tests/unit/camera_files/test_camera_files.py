@@ -222,20 +222,22 @@ def test_a_strong_lens_of_others_takes_more_than_one_coefficient(tmp_path: Path,
 def test_what_opencv_writes_is_read(tmp_path: Path) -> None:
     matrix = np.array([[700.0, 0, 320], [0, 703.0, 242], [0, 0, 1]])
     coefficients = np.array([[-0.25, 0.08, 0.0004, -0.0002, -0.01]])
-    for name in ("c.yml", "c.json", "c.xml"):
+    for name in ("c.yml", "vector.yml", "c.json", "c.xml"):
         storage = cv2.FileStorage(str(tmp_path / name), cv2.FILE_STORAGE_WRITE)
         storage.write("calibration_time", "Sat Nov 21 2026")
         storage.write("image_width", 640)
         storage.write("image_height", 480)
         storage.write("camera_matrix", matrix)
-        storage.write("distortion_coefficients", coefficients)
+        storage.write("distortion_coefficients", coefficients[0] if name == "vector.yml" else coefficients)
         storage.release()
     rows = f"image_width: 640\nimage_height: 480\nK: {matrix.tolist()}\nD: {coefficients.tolist()}\n"
     (tmp_path / "rows.yml").write_text(rows)
     nested = {"rows": 3, "cols": 3, "data": matrix.tolist()}
     (tmp_path / "nested.yml").write_text(rows.replace(str(matrix.tolist()), json.dumps(nested)))
-    found, *same = (read_camera_file(tmp_path / name) for name in ("c.yml", "c.json", "rows.yml", "nested.yml"))
-    assert same == [found, found, found]
+    found, *same = (
+        read_camera_file(tmp_path / name) for name in ("c.yml", "vector.yml", "c.json", "rows.yml", "nested.yml")
+    )
+    assert same == [found, found, found, found]
     with pytest.raises(InputError, match=r"c\.xml: is OpenCV's in XML, .* as YAML or JSON"):
         load_camera(tmp_path / "c.xml")
     assert found.kind == "OpenCV"

@@ -516,9 +516,11 @@ def test_positions_and_gcp_of_files(
         f"{east} {north} 0 199.5 149.5 {path.name} {path.stem}"
         for path, (east, north) in zip(plain, truth, strict=True)
     ]
-    (tmp_path / "gcp.txt").write_text("\n".join(["EPSG:32734", *lines]), encoding="utf-8")
+    elsewhere = "0 0 0 1 1 misspelt.jpg P"
+    (tmp_path / "gcp.txt").write_text("\n".join(["EPSG:32734", *lines, elsewhere]), encoding="utf-8")
     options = replace(cached, gcp=tmp_path / "gcp.txt", composite=replace(small, epsg=None))
     result = mosaic(plain, tmp_path / "a.tif", options)
+    assert any("1 of 7 lines are of none of the images (misspelt.jpg P)" in m.text for m in result.messages)
     assert by_positions.used == 6
     np.testing.assert_allclose(result.georeference.pixel_to_map, by_positions.pixel_to_map, atol=0.1)
     record = sidecar_of(tmp_path / "a.tif")["output"]["georeference"]

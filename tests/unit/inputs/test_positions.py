@@ -20,6 +20,7 @@ from rdstitch.inputs.positions import positions_of, with_positions
 from rdstitch.inputs.source import Source, read_sources
 from rdstitch.inputs.times import timestamps_of, with_times
 from rdstitch.io.metadata import Metadata
+from rdstitch.results.messages import Message
 from rdstitch.stage.positions import grid_from_table
 
 
@@ -215,7 +216,11 @@ def test_control_points(tmp_path: Path) -> None:
         "268900 6246200 12 1 2 elsewhere.jpg\n268900 6246200 12 1 2 c.jpg\n",
         encoding="utf-8",
     )
-    one, two, three = (source.control for source in with_ground_control(_sources(), file))
+    told = list[Message]()
+    one, two, three = (source.control for source in with_ground_control(_sources(), file, report=told.append))
+    assert [(message.severity, message.text) for message in told] == [
+        ("note", f"{file}: 1 of 4 lines are of none of the images (elsewhere.jpg)")
+    ]
     assert [(c.name, c.epsg, c.pixel) for c in (*one, *two)] == [
         ("P1", 32734, (300.5, 200.0)),
         ("P1", 32734, (10.0, 20.0)),
@@ -258,6 +263,16 @@ def test_latitude_and_longitude_are_what_they_are_whatever_system_a_list_names(t
     (tmp_path / "gcp").write_text(f"{rows}c.jpg,,7.1,30,20,3\n", encoding="utf-8")
     with pytest.raises(InputError, match="line 4: has no coordinates"):
         with_ground_control(_sources(), tmp_path / "gcp")
+
+
+def test_images_that_a_list_of_positions_lacks_are_named(tmp_path: Path) -> None:
+    told = list[Message]()
+    for rows in ("a.jpg,1,2\nB0.jpg,1,3\nc.jpg,,\n", "a.jpg,1,2\nb.jpg,1,3\nc.jpg,1,4\nof the next flight.jpg,1,5\n"):
+        (tmp_path / "p.csv").write_text(f"name,lat,lon\n{rows}", encoding="utf-8")
+        with_positions(_sources(), tmp_path / "p.csv", report=told.append)
+    (message,) = told
+    assert message.severity == "note"
+    assert message.text == f"{tmp_path / 'p.csv'}: has no position of 2 of 3 images (b.jpg, c.jpg)"
 
 
 def test_projected_numbers_in_other_notations_and_zero_longitude(tmp_path: Path) -> None:

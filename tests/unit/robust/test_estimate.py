@@ -1,5 +1,7 @@
 """The public functions of two-view estimation: their arguments, and what known tilts and solvers change."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -82,6 +84,14 @@ def test_a_known_tilt_is_used(solver: SolverName, both: bool) -> None:
     assert found.motion.yaw == pytest.approx(TRUE.yaw, abs=0.01)
     assert solver in ("auto", found.solver)
     _check_covariance(found)
+
+
+@pytest.mark.parametrize("known", [{"distortion": LENS.distortion}, {"image_size2": np.array(LENS.image_size)}])
+def test_a_covariance_has_the_parameters_that_are_named(known: dict[str, Any]) -> None:
+    size: Any = np.array(LENS.image_size)
+    found = estimate_radial_homography(MATCHES.points1, MATCHES.points2, size, **known)
+    assert found.covariance.shape == (len(found.parameters),) * 2
+    assert ("distortion" in found.parameters) is ("distortion" not in known)
 
 
 def _check_covariance(found: RadialHomography) -> None:

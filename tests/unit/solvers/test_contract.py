@@ -108,6 +108,27 @@ def test_range_is_respected_and_complete(case: Case) -> None:
     assert np.sort(narrow.distortion) == pytest.approx(np.sort(wide.distortion[inside]), abs=1e-8)
 
 
+@cases([case for case in CASES[:8] if case.name != "five_point_qep"])
+def test_an_open_range_ends_where_the_lens_model_does(case: Case) -> None:
+    x1, x2 = samples(case, noise=3e-3)
+    bounded, unbounded = (case.solve(x1, x2, distortion_range=(low, -low)) for low in (-5.0, -np.inf))
+    radius2 = np.maximum(*(np.einsum("bki,bki->bk", points, points).max(axis=1) for points in (x1, x2)))
+    for found in (bounded, unbounded):
+        assert (np.abs(found.distortion) * radius2[found.sample] < 1.0).all()
+    inside = np.abs(unbounded.distortion) < 5.0
+    assert np.array_equal(bounded.sample, unbounded.sample[inside])
+    assert np.sort(bounded.distortion) == pytest.approx(np.sort(unbounded.distortion[inside]), abs=1e-8)
+
+
+@cases([case for case in CASES if isinstance(case.solve, partial) and "distortion" in case.solve.keywords])
+@pytest.mark.parametrize("distortion", [-3.0, 3.0])
+def test_a_known_lens_that_folds_at_a_point_has_no_solution(case: Case, distortion: float) -> None:
+    x1, x2 = samples(case)
+    found = case.solve(x1, x2, distortion=distortion)
+    for points in (x1, x2):
+        assert (abs(distortion) * np.einsum("bki,bki->bk", points, points)[found.sample] < 1.0).all()
+
+
 @cases(CASES)
 def test_a_sample_depends_neither_on_its_batch_nor_on_a_batch_axis(case: Case) -> None:
     x1, x2 = samples(case, batch=40, noise=1e-3)
