@@ -155,7 +155,7 @@ def plan_canvas(
     """
     matrices = np.asarray(homographies, dtype=np.float64)
     called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)
-    refuse_singular(matrices, called)
+    check_placement(cameras, matrices, scale, rotate, reference, called, max_stretch)
     to_plane = [_oriented(c, g) for c, g in zip(cameras, matrices, strict=True)]
     px_per_unit = np.array([_resolution(c, g) for c, g in zip(cameras, to_plane, strict=True)])
     usual = abs(px_per_unit[reference]) if reference is not None else np.nanmedian(np.abs(px_per_unit))
@@ -191,8 +191,26 @@ def canvas_between(low: FloatArray, high: FloatArray, linear: FloatArray, outlin
     return Canvas((int(size[0]), int(size[1])), matrix, tuple(outline - low - 0.5 for outline in outlines))
 
 
-def refuse_singular(matrices: FloatArray, names: Sequence[str]) -> None:
-    """Refuse a homography that no image can be drawn by."""
+def check_placement(
+    cameras: Sequence[Camera],
+    matrices: FloatArray,
+    scale: float,
+    rotate: float,
+    reference: int | None,
+    names: Sequence[str],
+    max_stretch: float,
+) -> None:
+    """Refuse arguments of :func:`plan_canvas` that do not fit together."""
+    if not cameras or matrices.shape != (len(cameras), 3, 3) or len(names) != len(cameras):
+        raise ArgumentError(f"expected one homography (3, 3) per camera, not {matrices.shape} for {len(cameras)}")
+    if not (math.isfinite(scale) and scale > 0):
+        raise ArgumentError(f"scale must be positive, not {scale}")
+    if not math.isfinite(rotate):
+        raise ArgumentError(f"rotate must be an angle in degrees, not {rotate}")
+    if reference is not None and not 0 <= reference < len(cameras):
+        raise ArgumentError(f"reference must be the index of one of {len(cameras)} images, not {reference}")
+    if not max_stretch > 1.0:
+        raise ArgumentError(f"max_stretch must be larger than 1, not {max_stretch}")
     for matrix, name in zip(matrices, names, strict=True):
         if not np.isfinite(matrix).all() or np.linalg.cond(matrix) > 1e12:
             raise ArgumentError(f"{name}: the homography is singular or not finite")

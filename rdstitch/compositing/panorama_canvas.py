@@ -11,9 +11,9 @@ from rdstitch.choices import ProjectionName
 from rdstitch.compositing.canvas import (
     Canvas,
     canvas_between,
+    check_placement,
     plan_canvas,
     refuse_scale,
-    refuse_singular,
     turned_and_scaled,
 )
 from rdstitch.compositing.projection import PLANE, PROJECTIONS, TURN, Projection
@@ -103,7 +103,9 @@ def plan_panorama(
     ``max_stretch`` times has no place on it: the ends of a plane, the top and the bottom of a cylinder.
     """
     called = [f"image {k + 1}" for k in range(len(cameras))] if names is None else list(names)
-    refuse_singular(directions, called)
+    check_placement(cameras, directions, scale, rotate, reference, called, max_stretch)
+    if projection != "auto" and projection not in PROJECTIONS:
+        raise ArgumentError(f"projection must be one of auto, {', '.join(PROJECTIONS)}, not {projection!r}")
     seen = seen_directions(cameras, directions)
     chosen = choose_projection(seen) if projection == "auto" else PROJECTIONS[projection]
     if chosen == PLANE:

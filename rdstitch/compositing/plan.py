@@ -8,7 +8,7 @@ import numpy as np
 from rdstitch.compositing.blender import margin
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.transparency import OPACITY_BYTES
-from rdstitch.errors import LimitError
+from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.geometry.camera import Camera
 from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.system.machine import available_memory, processor_count
@@ -55,6 +55,8 @@ def plan_composite(
 
     ``masked``: some images have transparent parts.
     """
+    if len(cameras) != len(canvas.footprints):
+        raise ArgumentError(f"the canvas is for {len(canvas.footprints)} images, not for {len(cameras)}")
     bands = options.bands or usual_bands(cameras)
     limit = options.max_memory or default_memory()
     opacity = OPACITY_BYTES if masked or any(part is not None for part in canvas.near) else 0

@@ -119,7 +119,7 @@ class PackedFeatures:
 
 def _smallest(descriptors: Descriptors) -> NDArray[Any]:
     """Descriptors in the smallest type that holds them."""
-    integers = np.clip(descriptors, 0, 255).astype(np.uint8)
+    integers: NDArray[np.uint8] = np.clip(np.nan_to_num(descriptors), 0, 255).astype(np.uint8)
     if np.array_equal(integers, descriptors):
         return integers
     return descriptors.astype(np.float16 if np.abs(descriptors).max() <= _MAX_HALF else np.float32)

@@ -10,9 +10,6 @@ from rdstitch.arrays import FloatArray
 from rdstitch.geometry.camera import LENS_PARAMETERS, Camera
 from rdstitch.geometry.division_model import divisor, divisor_slope
 
-_COEFFICIENT_NAMES = ("λ", "μ", "ν")
-_ORDINALS = ("first", "second", "third")
-
 
 def describe_camera(alignment: Alignment, camera: Camera) -> tuple[str, ...]:
     """The lines of :func:`describe_lens`, one on the focal length, and one on the tilt."""

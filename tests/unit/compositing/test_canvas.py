@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from rdstitch.arrays import BoolArray
-from rdstitch.compositing import plan_canvas, plan_panorama
+from rdstitch.compositing import CompositeOptions, plan_canvas, plan_composite, plan_panorama
 from rdstitch.compositing.boxes import Box, aligned, bounds, cut, encloses, grown, intersection, without
 from rdstitch.compositing.cropping import crop_box, crop_rows, largest_rectangle
 from rdstitch.errors import ArgumentError, LimitError
@@ -87,11 +88,19 @@ def test_absurd_canvases_are_refused_by_name() -> None:
         plan_canvas([FLAT] * 2, np.stack([np.eye(3), near_horizon]), names=names, reference=0)
 
 
-def test_singular_homographies_are_refused() -> None:
+def test_wrong_options_and_homographies() -> None:
+    options: list[dict[str, Any]] = [{"scale": 0.0}, {"scale": np.nan}, {"rotate": np.inf}, {"names": []}]
     for plan in (plan_canvas, partial(plan_panorama, projection="sphere")):
-        for matrices in (np.zeros((1, 3, 3)), np.full((1, 3, 3), np.nan)):
-            with pytest.raises(ArgumentError, match="singular"):
+        for wrong in (*options, {"max_stretch": 1.0}, {"max_stretch": np.nan}, {"reference": 1}):
+            with pytest.raises(ArgumentError):
+                plan([FLAT], np.eye(3)[None], **wrong)
+        for matrices in (np.eye(3), np.zeros((1, 3, 3)), np.full((1, 3, 3), np.nan), np.stack([np.eye(3)] * 2)):
+            with pytest.raises(ArgumentError):
                 plan([FLAT], matrices)
+    with pytest.raises(ArgumentError, match=r"projection must be one of auto, plane, .*, not 'fisheye'"):
+        plan_panorama([FLAT], np.eye(3)[None], projection="fisheye")  # type: ignore[arg-type]
+    with pytest.raises(ArgumentError, match="is for 1 images, not for 0"):
+        plan_composite([], plan_canvas([FLAT], np.eye(3)[None]), CompositeOptions())
 
 
 def test_cropped_and_reduced_keep_the_geometry() -> None:
