@@ -32,13 +32,14 @@ def poses_table(result: StitchResult, frame: PosesFrame = "enu", height: float =
 
     Frames are those of :mod:`rdstitch.geometry.path_frames`, ``height`` that of the first image in the unit that
     positions shall have; or "map": easting, northing and the height above the ground in metres, with yaw zero where the
-    top of an image is north, and covariances relative to the reference image.
+    top of an image is north, and covariances relative to the place of the reference image.
     """
     registration = result.registration
     path = Trajectory.from_alignment(registration.alignment, height)
     if frame == "map":
         poses, to_map, place = _poses_and_map(result, "leave out --frame map")
-        path = Trajectory.on_map(poses, to_map, place.map_scale)
+        stds = {"length_std": registration.alignment.length_std, "scale_std": place.scale_std}
+        path = Trajectory.on_map(poses, to_map, place.map_scale, **stds)
     sources = registration.sources
     numbers = frame_numbers([source.frame for source in sources])
     path = path.labelled([source.name for source in sources], numbers, timestamps_of(sources))

@@ -68,6 +68,7 @@ class Georeference:
     map_scale: float = 1.0  # metres of the map per metre on the ground, where that is worth telling
     assumption: str = ""  # what had to be assumed of the cameras, and how far that may shift the map
     checks: tuple[Residual, ...] = ()  # of points that took no part
+    scale_std: float = 0.0  # relative, of the scale; of the direction in radians
 
     @property
     def used(self) -> int:

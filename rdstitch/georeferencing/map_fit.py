@@ -43,6 +43,7 @@ class MapFit:
     left_out: ComplexArray  # (N,): how far each position is from where all others put it
     used: BoolArray  # (N,)
     std: float | None  # of one coordinate of the ground, in the mean over what the images show
+    scale_std: float = 0.0  # relative, of the scale; of the direction in radians
     slope_squared: float = 0.0  # of the ground, over its variance
 
 
@@ -108,6 +109,7 @@ def _fitted(views: Views, measured: Measured, slope_std: float) -> MapFit | None
         left_out[:, 0] + 1j * left_out[:, 1],
         trust.used,
         math.sqrt(_ground_variance(scale * (views.ground - middle), step.covariance) * dependence),
+        math.sqrt(np.trace(step.covariance[_SCALE, _SCALE]) / 2.0 * dependence),
         float(slope @ np.linalg.solve(step.covariance[_SLOPE, _SLOPE], slope)),
     )
 

@@ -181,6 +181,7 @@ def _placed(known: _KnownPlaces, errors: AlignmentErrors, epsg: int | None, forc
         source,
         residuals=tuple(map(Residual.of, names, off.tolist(), used.tolist())),
         std=None if fit.std is None else math.hypot(fit.std, hills * abs(fit.scale)),
+        scale_std=fit.scale_std,
         map_scale=map_scale,
         assumption=assumption,
     )

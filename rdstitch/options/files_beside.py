@@ -48,7 +48,7 @@ class FilesBeside(ImageFiles):
         "enu",
         "Axes of --poses. enu, ros, camera: of the first image, as for 'rdstitch trajectory'. first: those of camera, "
         "and the sidecar has them too: the first image is the reference. map: easting, northing and height above the "
-        "ground, metres, where the output is georeferenced.",
+        "ground, metres, where the output is georeferenced, without --height.",
     )
     height: Height = None
     map_server: Path | None = writes(

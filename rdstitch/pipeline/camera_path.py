@@ -27,7 +27,7 @@ def camera_path(
     stored = QuarterTurns.of(sources).back.alignment(registration.alignment)
     path = Trajectory.from_alignment(stored, height or 1.0)
     if odometry is None:
-        messages = _scale_uncertainty(path)
+        messages = focal_unknown("all lengths", path.length_std)
     else:
         path, messages = _along_odometry(path, sources, odometry, keep_unit=height is not None)
     numbers = frame_numbers([source.frame for source in sources])
@@ -45,7 +45,7 @@ def _along_odometry(
         seen = times[np.isfinite(times)]
         of = f"those of the images are from {seen.min():.3f} to {seen.max():.3f} s" if len(seen) else "images have none"
         raise InputError(f"{odometry.name}: has times from {first:.3f} to {last:.3f} s, {of}; give --timestamps")
-    along, messages = along_odometry(path, bodies, keep_unit=keep_unit), _scale_uncertainty(path)
+    along, messages = along_odometry(path, bodies, keep_unit=keep_unit), focal_unknown("all lengths", path.length_std)
     if along is None:
         return path, [
             *messages,
@@ -64,10 +64,9 @@ def _along_odometry(
     return whole, messages
 
 
-def _scale_uncertainty(path: Trajectory) -> list[Message]:
-    """Warn if the focal length, and with it the scale of a path by images, is hardly known."""
-    if not path.length_std > Limits.max_length_std:
+def focal_unknown(lengths: str, std: float) -> list[Message]:
+    """Warn if the focal length, and with it these lengths, is hardly known by the images."""
+    if not std > Limits.max_length_std:
         return []
-    off = f"all lengths may be off together by {path.length_std:.0%}"
-    text = f"{off}: the images hardly show the focal length; give --focal"
+    text = f"{lengths} may be off together by {std:.0%}: the images hardly show the focal length; give --focal"
     return [Message(text, code="focal-unknown")]

@@ -41,13 +41,14 @@ from rdstitch.stage.grid import TileGrid
 from rdstitch.stage.pair_candidates import SearchPlan
 from rdstitch.stage.positions import Scan, grid_from_arrays, grid_from_names, grid_from_table, grid_from_tiles
 from rdstitch.stage.register_tiles import LensEstimate, TileRegistration, register_tiles
-from rdstitch.stage.sentences import axes_contradicted
+from rdstitch.stage.sentences import axes_contradicted, neighbours_contradicted
 from rdstitch.stage.tile_inputs import as_tiles, tile_frames
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.outputs import Outputs, text_bytes
 from rdstitch.system.progress import Progress, silent
 
 _SAMPLED_OVERLAPS = 32  # overlaps by which a flat field is judged
+_FEW_WRONG = 0.01  # of the overlaps: of lines of a hundred tiles a hundredth is at the ends, and a wrong one is fewer
 
 
 @one_native_thread()
@@ -221,6 +222,10 @@ def _placed(
     known = LensEstimate.FREE if options.distortion == "auto" else options.distortion
     lens = LensEstimate.IF_SHOWN if known is None else known
     tiled = register_tiles(replace(plan, grid=grid), read, distortion=lens, progress=progress)
+    off, held = tiled.contradicting, int(tiled.adjustment.holding.sum())
+    if len(off) > _FEW_WRONG * held:
+        names = [sources[k].name for k in off[0].tolist()]
+        messages.append(neighbours_contradicted(nominal.source, names, len(off), held))
     for index in set(range(len(grid))) - set(tiled.compared.ravel().tolist()):
         read(index)
     field = sources[0].flat_field

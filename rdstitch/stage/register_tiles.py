@@ -69,6 +69,13 @@ class TileRegistration:
         return np.asarray(np.linalg.norm(self.adjustment.off_stage, axis=1))
 
     @property
+    def contradicting(self) -> IntArray:
+        """Pairs (K, 2) that hold their tiles, but where the grid does not have them by half a tile or more."""
+        held = self.links.tiles[self.adjustment.holding]
+        shown, told = (places[held[:, 1]] - places[held[:, 0]] for places in (self.adjustment.places, self.grid.places))
+        return held[(np.abs(shown - told) > np.array(self.grid.size) / 2.0).any(axis=1)]
+
+    @property
     def mostly_nominal(self) -> bool:
         """Whether more tiles have their places from the stage alone than from what they show."""
         return 2 * int(self.linked.sum()) < len(self.grid)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rdstitch.arrays import FloatArray
 from rdstitch.inputs.odometry import BodyMotion, BodyPose, motion_between
 from rdstitch.numerics.robust_loss import RAYLEIGH_MEDIAN
-from rdstitch.trajectories.trajectory import Trajectory
+from rdstitch.trajectories.trajectory import Trajectory, without_length
 
 _EXACT = 1e-6  # of the longest step: no odometry is more exact, whatever it states
 _WHEELS = 0.01  # relative standard deviation of what all distances share: the size of the wheels
@@ -125,8 +125,7 @@ def along_odometry(
     if fit is None:
         return None
     if path.covariance is not None:
-        each = zip(path.covariance, path.position, strict=True)
-        path = replace(path, covariance=np.array([_without_length(one, place, path.length_std) for one, place in each]))
+        path = replace(path, covariance=without_length(path.covariance, path.position, path.length_std))
     by_images = path.length_std
     if not keep_unit:
         path, fit = _in_unit_of(fit, path)
@@ -149,14 +148,6 @@ def _in_unit_of(fit: OdometryFit, path: Trajectory) -> tuple[Trajectory, Odometr
     scaled = replace(path, position=position, height=height, covariance=covariance, length_std=fit.length_std)
     by_unit = np.diag([1.0 / unit, 1.0])
     return scaled, replace(fit, scale=fit.scale / unit, covariance=by_unit @ fit.covariance @ by_unit)
-
-
-def _without_length(covariance: FloatArray, place: FloatArray, length_std: float) -> FloatArray:
-    """The covariance (4, 4) of a pose by all but the length that it shares with others."""
-    along = np.array([*place, 0.0, 0.0])
-    moved = covariance @ along
-    spread, shared = float(along @ moved), length_std**2 * float(place @ place) ** 2
-    return covariance - np.outer(moved, moved) * min(shared / spread, 1.0) / spread if spread > 0.0 else covariance
 
 
 class _Prediction(NamedTuple):

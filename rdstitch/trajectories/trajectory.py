@@ -127,7 +127,15 @@ class Trajectory:
         return replace(path, covariance=covariance)
 
     @classmethod
-    def on_map(cls, poses: PlanarPoses, to_map: FloatArray, map_scale: float = 1.0) -> Self:
+    def on_map(
+        cls,
+        poses: PlanarPoses,
+        to_map: FloatArray,
+        map_scale: float = 1.0,
+        *,
+        length_std: float = 0.0,
+        scale_std: float = 0.0,
+    ) -> Self:
         """The poses that are not NaN on a map: positions are (easting, -northing), so that "enu" gives both.
 
         Parameters
@@ -136,6 +144,10 @@ class Trajectory:
             A similarity from the plane of the poses, y downwards, to easting and northing, m on the map.
         map_scale : float
             Metres of the map per metre on the ground, in which heights are.
+        length_std : float
+            Relative standard deviation that all lengths of the poses share: on a map, that of the heights.
+        scale_std : float
+            Standard deviation of the similarity: relative of its scale, and of its direction in radians.
         """
         frame = np.flatnonzero(np.isfinite(poses.yaw))
         change = np.diag([1.0, -1.0]) @ to_map
@@ -147,7 +159,16 @@ class Trajectory:
             return path
         whole = np.diag([1.0, 1.0, unit, 1.0])
         whole[:2, :2] = change[:, :2]
-        return replace(path, covariance=whole @ poses.covariance[frame] @ whole.T)
+        covariance = whole @ without_length(poses.covariance[frame], poses.position[frame], length_std) @ whole.T
+        (x, y), zero = (position - change[:, 2]).T, np.zeros(len(frame))
+        shared = np.array(
+            [
+                length_std * np.stack([zero, zero, path.height, zero]),
+                scale_std * np.stack([x, y, path.height, zero]),
+                scale_std * np.stack([y, -x, zero, zero + 1.0]),
+            ]
+        )
+        return replace(path, covariance=covariance + np.einsum("kin,kjn->nij", shared, shared))
 
     def __repr__(self) -> str:
         """One line: the number of frames and the length of the path."""
@@ -161,3 +182,12 @@ class Trajectory:
     def length(self) -> float:
         """Length of the path."""
         return float(np.linalg.norm(np.diff(self.position, axis=0), axis=1).sum())
+
+
+def without_length(covariances: FloatArray, places: FloatArray, length_std: float) -> FloatArray:
+    """The covariances (N, 4, 4) of poses at places (N, 2) by all but the length that they share."""
+    along = np.pad(places, ((0, 0), (0, 2)))
+    moved = np.einsum("nij,nj->ni", covariances, along)
+    spread = np.maximum(np.einsum("ni,ni->n", along, moved), 1e-300)
+    shared = np.minimum((length_std * (places**2).sum(axis=1)) ** 2 / spread, 1.0) / spread
+    return np.asarray(covariances - shared[:, None, None] * moved[:, :, None] * moved[:, None])

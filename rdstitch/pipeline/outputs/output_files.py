@@ -15,6 +15,7 @@ from rdstitch.export.trajectory_files import check_bag
 from rdstitch.georeferencing.georeference import world_file_paths
 from rdstitch.georeferencing.place_on_map import MIN_POSITIONS, has_place
 from rdstitch.inputs.source import Source
+from rdstitch.pipeline.camera_path import focal_unknown
 from rdstitch.pipeline.run import Run
 from rdstitch.results.messages import Message
 from rdstitch.results.registration import Registration
@@ -118,7 +119,10 @@ class OutputFiles:
         """Stage the files beside an image; the result gets a warning for each that fails."""
         for each in self.beside:
             result = result.with_messages(self.run.outputs.attempt(each.place, partial(each.stage, result)))
-        return result
+        if self.run.beside.poses is None:
+            return result
+        lengths = "heights above the ground, or places in units of them,"
+        return result.with_messages(focal_unknown(lengths, result.registration.alignment.length_std))
 
 
 def save_camera(registration: Registration, run: Run) -> None:

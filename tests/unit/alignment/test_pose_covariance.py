@@ -78,6 +78,29 @@ def test_the_frame_of_the_first_image_and_the_map_keep_them_true() -> None:
         np.testing.assert_allclose(path.covariance / scale, found / scale, atol=0.08)
 
 
+def test_on_a_map_the_focal_length_is_in_the_heights() -> None:
+    """Places are as exact as the map, whatever images know of lengths: what they are wrong by, its scale is too."""
+    rng, noise, length_std, scale_std = np.random.default_rng(4), 0.003, 0.05, 0.02
+    place, height = rng.uniform(-3.0, 3.0, (5, 2)) * [[0.0], [1.0], [1.0], [1.0], [1.0]], np.linspace(1.0, 1.2, 5)
+    squares = []
+    for _ in range(400):
+        length, map_error = length_std * rng.normal(), scale_std * (rng.normal(size=2) @ [1.0, 1.0j])
+        found = (place + noise * rng.normal(size=(5, 2)) * (place != 0.0)) * (1.0 + length)
+        covariance = np.zeros((5, 4, 4))
+        covariance[1:, :2, :2] = noise**2 * np.eye(2) + length_std**2 * found[1:, :, None] * found[1:, None]
+        scale = 40.0 * np.exp(0.3j + map_error) / (1.0 + length)
+        to_map = np.array([[scale.real, scale.imag, 5e5], [scale.imag, -scale.real, 5e6]])
+        poses = PlanarPoses(np.zeros(5), found, height, np.zeros((5, 2)), covariance)
+        path = Trajectory.on_map(poses, to_map, length_std=length_std, scale_std=scale_std)
+        true = 40.0 * np.exp(0.3j) * (place @ [1.0, -1.0j])
+        right = np.column_stack([5e5 + true.real, -5e6 - true.imag, 40.0 * height, np.full(5, 0.3)])
+        squares.append((_values(path) - right) ** 2 / np.maximum(np.einsum("nii->ni", path.covariance), 1e-9))
+    of_each = np.mean(squares, axis=0)
+    assert (of_each[0, :2] < 1e-6).all()
+    assert (of_each[1:] > 0.8).all()
+    assert (of_each[1:] < 1.25).all()
+
+
 @pytest.mark.parametrize(("frame", "sign"), [("enu", -1.0), ("camera", 1.0)])
 def test_the_table_has_them_in_its_own_axes_and_units(frame: TrajectoryFrame, sign: float) -> None:
     path = Trajectory.from_poses(_sampled()[0])

@@ -29,6 +29,7 @@ from rdstitch.inputs.delays import MeasuredTilt
 from rdstitch.inputs.named_system import NamedSystem
 from rdstitch.io.strips import ImageSpec
 from rdstitch.io.write import write_strips
+from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.apply_sidecar import apply
 from rdstitch.pipeline.composition.map_canvas import canvas_on_map
@@ -492,13 +493,30 @@ def test_positions_are_those_of_cameras(yaw: float, slope: float, altitude_std: 
 @pytest.mark.parametrize("std", [0.02, 3.0])
 def test_the_error_of_the_map_is_as_large_as_told(std: float) -> None:
     middle_of_field = [(300.0, 225.0)]
-    errors = []
+    errors, turns = [], []
     for seed in range(40):
         flown, truth = _survey(seed, (-0.05, 0.03), 3.0, std, altitude_std=2 * std)
         place, _ = flown.place()
         errors.append((place.to_map(middle_of_field) - truth.to_map(middle_of_field)) / place.std)
+        turns.append(np.log(place.scale / truth.scale) / place.scale_std)
     assert 0.4 < np.mean(np.square(errors)) < 2.0
     assert np.abs(errors).max() < 5.0
+    assert 0.4 < np.mean(np.abs(turns) ** 2) / 2.0 < 2.0
+
+
+def test_poses_on_a_map_say_that_nobody_knows_how_high_they_are(
+    located: tuple[list[Path], FloatArray], cached: StitchOptions, tmp_path: Path
+) -> None:
+    options = replace(cached, pose_covariance=True, composite=CompositeOptions(scale=0.3))
+    beside = FilesBeside(poses=tmp_path / "p.csv", frame="map")
+    result = mosaic(located[0], tmp_path / "a.tif", options, beside=beside)
+    assert [message.code for message in result.messages].count("focal-unknown") == 1
+    table = np.genfromtxt(tmp_path / "p.csv", delimiter=",", names=True)
+    true, std = METRES_PER_TEXEL * flight(4, 3, 2).poses.height, np.sqrt(table["cov_height_height"])
+    assert (std > 0.05 * true).all()
+    assert (np.abs(table["height"] - true) < 3.0 * std).all()
+    # What GPS says of places: images leave a third of such lengths open.
+    assert (np.sqrt(table["cov_x_x"] + table["cov_y_y"]) < 0.1 * true).all()
 
 
 def test_positions_and_gcp_of_files(

@@ -1,5 +1,6 @@
 """``rdstitch.tiles`` on arrays and on files that are not all alike."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +107,19 @@ def test_a_tile_that_cannot_be_read_moves_no_other(tmp_path: Path, by: str, lost
     assert [Path(message.images[0]) for message in registration.left_out] == [files[lost]]
     off = found[0].grid.places - STAGE.nominal[kept]
     np.testing.assert_allclose(off, np.broadcast_to(off[0], off.shape), atol=2.0)
+
+
+@pytest.mark.parametrize("columns", [3, 4])
+def test_columns_that_the_tiles_contradict_are_told(tmp_path: Path, columns: int) -> None:
+    stage = replace(STAGE, rows=3)
+    order = [*range(3), *range(5, 2, -1), *range(6, 9)]  # a snake
+    for number, k in enumerate(order):
+        tifffile.imwrite(tmp_path / f"img_{number}.tif", stage.render(k))
+    scan: dict[str, Any] = {"grid": "img_{number}", "columns": columns, "order": "snake-rows", "overlap": 20.0}
+    _, registration = rdstitch.place_tiles(tmp_path, **scan)
+    told = [message.text for message in registration.messages if message.code == "grid-as-shown"]
+    assert len(told) == (columns == 4)
+    assert columns == 3 or "overlaps, as that of img_2.tif and img_3.tif, are not where it has them" in told[0]
 
 
 def test_tiles_of_several_sizes_lie_where_they_are(tmp_path: Path) -> None:
