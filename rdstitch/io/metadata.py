@@ -185,7 +185,7 @@ def _metadata(
         make=tag_text(exif.get(ExifTags.Base.Make)),
         model=tag_text(exif.get(ExifTags.Base.Model)),
         serial=next(filter(None, map(tag_text, serials)), ""),
-        dpi=(float(dpi[0]), float(dpi[1])) if dpi and all(finite(d) for d in dpi) else None,
+        dpi=turned_size((float(dpi[0]), float(dpi[1])), orientation) if dpi and all(finite(d) for d in dpi) else None,
         exposure=exposure_of(photo),
         radiometry=read_radiometry(xmp, info.get("black_level"), bit_depth),
         timestamp=time_taken(photo),

@@ -171,6 +171,13 @@ class TestMetadata:
         Image.new("L", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
         assert read_metadata(tmp_path / "a.jpg").gps.altitude == sign * 430.0
 
+    @pytest.mark.parametrize(("orientation", "dpi"), [(1, (300, 150)), (3, (300, 150)), (6, (150, 300))])
+    def test_dpi_are_turned_with_the_image(self, tmp_path: Path, orientation: int, dpi: tuple[int, int]) -> None:
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        Image.new("L", (8, 6)).save(tmp_path / "a.jpg", exif=exif, dpi=(300, 150))
+        assert read_metadata(tmp_path / "a.jpg").dpi == dpi
+
     @pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif", "ome.tif"])
     @pytest.mark.parametrize("coding", ["utf-8", "latin-1"])
     def test_names_keep_their_bytes(self, tmp_path: Path, suffix: str, coding: str) -> None:
