@@ -4,12 +4,14 @@ What belongs to the camera (its lens, its tilt, what hides a part of every image
 turned with it; what people look at is upright.
 """
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rdstitch.arrays import FloatArray
+
+Number = TypeVar("Number", int, float)
 
 SIDEWAYS = (5, 6, 7, 8)
 """Orientations that exchange the axes, before either of them is reversed."""
@@ -36,8 +38,8 @@ def turned(samples: NDArray[Any], orientation: int) -> NDArray[Any]:
     return samples
 
 
-def turned_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
-    """Width and height after :func:`turned`."""
+def turned_size(size: tuple[Number, Number], orientation: int) -> tuple[Number, Number]:
+    """Width and height, or what is along them, after :func:`turned`."""
     return (size[1], size[0]) if orientation in SIDEWAYS else size
 
 

@@ -136,7 +136,7 @@ def upright_exif(exif: Image.Exif, width: int) -> bytes:
     # First, since what is not of the type that belongs to it cannot be written.
     exif[ExifTags.Base.Orientation] = 1
     try:
-        data = exif.tobytes()
+        data = _written(exif)
     except _UNWRITABLE:
         return b""
     return _edited(data, clean)
@@ -159,9 +159,16 @@ def _edited(data: bytes, edit: Callable[[Image.Exif], object]) -> bytes:
     try:
         exif.load(data)
         edit(exif)
-        return exif.tobytes() if len(exif) else b""
+        return _written(exif) if len(exif) else b""
     except _UNWRITABLE:
         return b""
+
+
+def _written(exif: Image.Exif) -> bytes:
+    """An EXIF block; its text keeps its bytes, of which Pillow, who reads them as Latin-1, writes ASCII only."""
+    for tags in (exif, *map(exif.get_ifd, (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo))):
+        tags.update({tag: text.encode("latin-1") for tag, text in tags.items() if isinstance(text, str)})
+    return exif.tobytes()
 
 
 def _keep_author_and_time(exif: Image.Exif) -> None:

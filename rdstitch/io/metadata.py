@@ -160,14 +160,9 @@ def _tiff_metadata(file: Path, stream: BinaryIO) -> Metadata:
 
 
 def _raw_metadata(file: Path) -> Metadata:
-    size = raw_size(file)
+    size, orientation = raw_size(file)
     exif = raw_exif(file)
-    photo = exif.get_ifd(ExifTags.IFD.Exif)
-    tags = ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight
-    width, height = (finite(photo.get(tag)) for tag in tags)
-    if width and height and (width - height) * (size[0] - size[1]) < 0:
-        # They are those of the sensor, of a camera that was held upright.
-        photo.update(zip(tags, (height, width), strict=True))
+    exif[ExifTags.Base.Orientation] = orientation
     return _metadata(exif, {}, size, 16, 3)
 
 
@@ -202,7 +197,7 @@ def _metadata(
         make=tag_text(exif.get(ExifTags.Base.Make)),
         model=tag_text(exif.get(ExifTags.Base.Model)),
         serial=next(filter(None, map(tag_text, serials)), ""),
-        dpi=(float(dpi[0]), float(dpi[1])) if dpi and all(finite(d) for d in dpi) else None,
+        dpi=turned_size((float(dpi[0]), float(dpi[1])), orientation) if dpi and all(finite(d) for d in dpi) else None,
         exposure=exposure_of(photo),
         radiometry=read_radiometry(xmp, info.get("black_level"), bit_depth),
         timestamp=time_taken(photo),

@@ -14,6 +14,7 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from rdstitch.io.opening import reader_package
 
 _BITS = 16
+_ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}  # EXIF's, by what LibRaw calls flip
 _KEPT_TAGS = {int(getattr(ExifTags.Base, name)) for name in ("Make", "Model", "Artist", "Copyright", "DateTime")}
 _KEPT_BLOCKS = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)
 
@@ -29,19 +30,17 @@ def own_exif(exif: Image.Exif) -> Image.Exif:
 
 
 def read_raw(path: Path) -> NDArray[np.uint16]:
-    """Samples (h, w, 3) of a raw file, upright, with the camera's white balance, in sRGB without automatic exposure."""
+    """Samples (h, w, 3) of a raw file as it is stored, with the camera's white balance, in sRGB, not brightened."""
     with _raw(path) as raw:
-        samples = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=_BITS)
+        samples = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=_BITS, user_flip=0)
         return np.asarray(samples, dtype=np.uint16)
 
 
-def raw_size(path: Path) -> tuple[int, int]:
-    """Width and height of a raw file, upright, without developing it."""
+def raw_size(path: Path) -> tuple[tuple[int, int], int]:
+    """Width and height of a raw file as it is stored, and its EXIF orientation, without developing it."""
     with _raw(path) as raw:
         sizes = raw.sizes
-        sideways = sizes.flip in (5, 6)
-        size = (sizes.iheight, sizes.iwidth) if sideways else (sizes.iwidth, sizes.iheight)
-        return int(size[0]), int(size[1])
+        return (int(sizes.iwidth), int(sizes.iheight)), _ORIENTATIONS[sizes.flip]
 
 
 def raw_exif(path: Path) -> Image.Exif:

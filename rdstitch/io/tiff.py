@@ -144,9 +144,8 @@ def copied_tags(metadata: Metadata) -> Iterator[ExtraTag]:
         for tag in _COPIED_TAGS:
             text = exif.get(tag)
             # Cameras pad with zeros, of which GDAL warns.
-            text = text.split("\0")[0].strip() if isinstance(text, str) else ""
-            if text and text.isascii():
-                yield int(tag), 2, 0, text, True
+            if isinstance(text, str) and (text := text.split("\0")[0].strip()):
+                yield int(tag), 2, 0, text.encode("latin-1"), True  # the bytes that they were read from
 
 
 def tiles_of(strips: Iterable[AnyArray]) -> Iterator[AnyArray]:

@@ -18,6 +18,7 @@ from PIL import ExifTags, Image, features
 from PIL.PngImagePlugin import PngInfo
 
 from rdstitch.errors import InputError
+from rdstitch.geometry.exif_orientation import turned
 from rdstitch.inputs.find import find_images
 from rdstitch.io import read as reading
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
@@ -175,9 +176,18 @@ def test_raw_files(tmp_path: Path) -> None:
     assert np.corrcoef(levels, np.arange(len(levels)))[0, 1] > 0.9
 
 
-@pytest.mark.parametrize("size", [(6000, 4000), (4000, 6000)])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_raw_files_are_turned_by_their_orientation(tmp_path: Path, orientation: int) -> None:
+    pytest.importorskip("rawpy")
+    stored, file = read_image(_dng(tmp_path / "a.dng")), _dng(tmp_path / "b.dng", orientation)
+    image, metadata = read_image(file), read_metadata(file)
+    np.testing.assert_array_equal(image.pixels, turned(stored.pixels, orientation))
+    assert (metadata.orientation, metadata.size) == (orientation, image.pixels.shape[1::-1])
+
+
+@pytest.mark.parametrize(("orientation", "size"), [(1, (6000, 4000)), (3, (6000, 4000)), (8, (4000, 6000))])
 def test_the_focal_length_of_a_raw_file_holds_for_its_image_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, orientation: int, size: tuple[int, int]
 ) -> None:
     """Its tags count pixels of the sensor, however the camera was held; and of a camera without a name too."""
     tag = ExifTags.Base
@@ -185,13 +195,13 @@ def test_the_focal_length_of_a_raw_file_holds_for_its_image_too(
     photo: dict[int, float] = {tag.FocalLength: 50.0, tag.FocalPlaneXResolution: 4000.0}
     exif.get_ifd(ExifTags.IFD.Exif).update(photo | {tag.ExifImageWidth: 6000, tag.ExifImageHeight: 4000})
     monkeypatch.setattr("rdstitch.io.metadata.raw_exif", lambda _: exif)
-    monkeypatch.setattr("rdstitch.io.metadata.raw_size", lambda _: size)
+    monkeypatch.setattr("rdstitch.io.metadata.raw_size", lambda _: ((6000, 4000), orientation))
     (tmp_path / "a.cr2").write_bytes(b"raw")
     metadata = read_metadata(tmp_path / "a.cr2")
     write_image(tmp_path / "a.jpg", np.zeros((size[1], size[0]), np.uint8), None, metadata)
     focal = [metadata.focal_px, read_metadata(tmp_path / "a.jpg").focal_px]
     assert focal == pytest.approx([50.0 / 25.4 * 4000.0] * 2)
-    assert (metadata.size, metadata.channels) == (size, 3)
+    assert (metadata.size, metadata.channels, metadata.orientation) == (size, 3, orientation)
 
 
 @pytest.mark.parametrize(("name", "package"), [("a.heic", "pillow_heif"), ("a.CR3", "rawpy")])
@@ -241,7 +251,7 @@ def test_the_limit_of_memory_knows_channels_and_depth(
     assert read_image(file).pixels.dtype == np.uint16
 
 
-def _dng(file: Path) -> Path:
+def _dng(file: Path, orientation: int = 1) -> Path:
     """A mosaic of a grey ramp, as the simplest DNG."""
     width, height = 256, 192
     ramp = np.tile(np.linspace(200, 3800, width), (height, 1)).astype(np.uint16)
@@ -249,6 +259,7 @@ def _dng(file: Path) -> Path:
     tags = [
         (271, 2, 0, "Maker", True),
         (272, 2, 0, "Model", True),
+        (274, 3, 1, orientation, True),
         (33421, 3, 2, (2, 2), True),
         (33422, 1, 4, b"\x00\x01\x01\x02", True),
         (50706, 1, 4, b"\x01\x04\x00\x00", True),

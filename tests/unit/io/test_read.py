@@ -19,6 +19,7 @@ from rdstitch.io.attitude import CONVENTIONS
 from rdstitch.io.lens_correction import corrected
 from rdstitch.io.metadata import Metadata, read_metadata
 from rdstitch.io.read import DecodedImage, read_image
+from rdstitch.io.write import write_image
 
 Samples = NDArray[Any]
 
@@ -169,6 +170,26 @@ class TestMetadata:
         exif[0x8825] = {1: "N", 2: (31.0, 30.0, 0.0), 3: "E", 4: (35.0, 30.0, 0.0), 5: reference, 6: 430.0}
         Image.new("L", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
         assert read_metadata(tmp_path / "a.jpg").gps.altitude == sign * 430.0
+
+    @pytest.mark.parametrize(("orientation", "dpi"), [(1, (300, 150)), (3, (300, 150)), (6, (150, 300))])
+    def test_dpi_are_turned_with_the_image(self, tmp_path: Path, orientation: int, dpi: tuple[int, int]) -> None:
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        Image.new("L", (8, 6)).save(tmp_path / "a.jpg", exif=exif, dpi=(300, 150))
+        assert read_metadata(tmp_path / "a.jpg").dpi == dpi
+
+    @pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif", "ome.tif"])
+    @pytest.mark.parametrize("coding", ["utf-8", "latin-1"])
+    def test_names_keep_their_bytes(self, tmp_path: Path, suffix: str, coding: str) -> None:
+        author, exif = "© Jürgen Müller".encode(coding), Image.Exif()
+        exif[0x013B] = exif[0x8298] = author
+        Image.new("L", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
+        metadata = read_metadata(tmp_path / "a.jpg")
+        for written in (metadata, metadata.of_composite()):
+            write_image(tmp_path / f"b.{suffix}", np.zeros((8, 8), np.uint8), metadata=written)
+            with Image.open(tmp_path / f"b.{suffix}") as image:
+                tags = image.getexif()
+            assert [tags[tag].encode("latin-1") for tag in (0x013B, 0x8298)] == [author, author]
 
     def test_place_and_attitude(self, tmp_path: Path) -> None:
         exif = Image.Exif()
