@@ -18,7 +18,7 @@ from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding,
 from rdstitch.io.raw import read_raw
 from rdstitch.io.read_tiff import as_opacity, first_image_pages, read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
-from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME, as_alpha
+from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME, as_alpha, split_alpha
 from rdstitch.system.file_access import open_regular, read_beginning
 from rdstitch.system.late_imports import imagecodecs, tifffile
 
@@ -74,7 +74,7 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
                 metadata = metadata or metadata_of(opened)
                 if magic == PNG_MAGIC and metadata.bit_depth == 16 and opened.mode not in GREY_16:
                     # Pillow would cut 16-bit colour to 8.
-                    samples, alpha = _split(imagecodecs.png_decode(read_beginning(file, _most_bytes(opened.size))))
+                    samples, alpha = split_alpha(imagecodecs.png_decode(read_beginning(file, _most_bytes(opened.size))))
                 else:
                     factor, decoded = _decoder_reduction(opened, metadata, reduction), None
                     if opened.format in _JPEG and opened.mode in ("L", "RGB"):
@@ -165,13 +165,6 @@ def _samples(image: Image.Image) -> AnyArray:
         bottom = min(top + ROWS_AT_A_TIME, height)
         samples[top:bottom] = np.asarray(image.crop((0, top, width, bottom)))
     return samples
-
-
-def _split(samples: AnyArray) -> tuple[AnyArray, AnyArray | None]:
-    """Grey or colours, and alpha, of an array (h, w, 2) or (h, w, 4); any other as it is."""
-    if samples.ndim == 2 or samples.shape[2] == 3:
-        return samples, None
-    return (samples[..., 0] if samples.shape[2] == 2 else samples[..., :3]), samples[..., -1]
 
 
 def _read_tiff(file: Path) -> tuple[AnyArray, AnyArray | None]:
