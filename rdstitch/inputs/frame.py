@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -110,7 +110,9 @@ def _as_input(item: Any, index: int, channel_order: ChannelOrder) -> Named:
         )
     name = f"image_{index:04d}"
     if isinstance(item, PIL.Image.Image):
-        return Frame(Path(name), index, image=as_image(Path(name), *from_pillow(item), metadata_of(item)))
+        samples, alpha = from_pillow(item)
+        metadata = replace(metadata_of(item), bit_depth=8 * samples.itemsize)  # as Pillow shows it
+        return Frame(Path(name), index, image=as_image(Path(name), samples, alpha, metadata))
     if not isinstance(item, np.ndarray):
         kind, remedy = type(item).__name__, "convert it by numpy.asarray"
         if type(item).__module__.partition(".")[0] == "torch":
