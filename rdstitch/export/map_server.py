@@ -70,7 +70,7 @@ def write_map(result: StitchResult, folder: Path, height: float, outputs: Output
 def _check_memory(file: Path, result: StitchResult, size: tuple[int, int]) -> None:
     """Refuse a map whose making would take more memory than there is: that the mosaic is kept counts more."""
     output, sources = result.canvas.size, result.placed.sources
-    pixel = max(one.metadata.channels * max(one.metadata.bit_depth // 8, 1) for one in sources) + _OUTPUT_BYTES
+    pixel = max(one.metadata.channels * -(-one.metadata.bit_depth // 8) for one in sources) + _OUTPUT_BYTES
     limit = result.options.composite.max_memory or default_memory()
     if (need := math.prod(output) * pixel + math.prod(size) * _MAP_BYTES) > limit:
         raise LimitError(

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -15,6 +15,7 @@ from rdstitch.choices import ChannelOrder
 from rdstitch.errors import ArgumentError
 from rdstitch.io.metadata import Metadata, metadata_of
 from rdstitch.io.read import DecodedImage, as_image, from_pillow
+from rdstitch.io.samples import split_alpha
 from rdstitch.system.file_access import canonical_name, without_query
 
 
@@ -109,7 +110,9 @@ def _as_input(item: Any, index: int, channel_order: ChannelOrder) -> Named:
         )
     name = f"image_{index:04d}"
     if isinstance(item, PIL.Image.Image):
-        return Frame(Path(name), index, image=as_image(Path(name), *from_pillow(item), metadata_of(item)))
+        samples, alpha = from_pillow(item)
+        metadata = replace(metadata_of(item), bit_depth=8 * samples.itemsize)  # as Pillow shows it
+        return Frame(Path(name), index, image=as_image(Path(name), samples, alpha, metadata))
     if not isinstance(item, np.ndarray):
         kind, remedy = type(item).__name__, "convert it by numpy.asarray"
         if type(item).__module__.partition(".")[0] == "torch":
@@ -126,13 +129,12 @@ def array_as_image(name: str, array: AnyArray, channel_order: ChannelOrder) -> D
     array = array.astype(array.dtype.newbyteorder("="), copy=False)
     if array.dtype not in (np.uint8, np.uint16) and array.dtype.kind != "f":
         raise ArgumentError(f"{name}: expected uint8, uint16 or floating-point samples, not {array.dtype}")
-    channels = 1 if array.ndim == 2 else array.shape[2]
-    alpha = array[..., -1] if array.ndim == 3 and channels in (2, 4) else None
-    samples = array if alpha is None else array[..., :-1]
-    if array.ndim == 3 and channels <= 2:
+    samples, alpha = split_alpha(array)
+    if samples.shape[2:] == (1,):
         samples = samples[..., 0]
     samples = to_channel_order(
         np.array(samples, dtype=np.float32 if array.dtype.kind == "f" else array.dtype), channel_order
     )
+    channels = 1 if array.ndim == 2 else array.shape[2]
     metadata = Metadata((array.shape[1], array.shape[0]), bit_depth=8 * array.dtype.itemsize, channels=channels)
     return as_image(Path(name), samples, None if alpha is None else alpha.copy(), metadata)

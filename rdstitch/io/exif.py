@@ -8,13 +8,16 @@ import struct
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from PIL import ExifTags, Image
 
 from rdstitch.geometry.camera import is_focal_length
 from rdstitch.geometry.places import GpsPosition
 from rdstitch.io.attitude import finite, xmp_number
+
+if TYPE_CHECKING:
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_RESOLUTION_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
@@ -151,6 +154,27 @@ def without_film_size(data: bytes) -> bytes:
 def author_and_time(data: bytes) -> bytes:
     """EXIF of an image made from several: no lens, exposure or place of one of them is true of it."""
     return _edited(data, _keep_author_and_time)
+
+
+def exif_blocks(exif: Image.Exif) -> dict[int, dict[int, Any]]:
+    """The blocks of exposure and place, by their tags, with what is a block of its own in that of exposure."""
+    photo = exif.get_ifd(ExifTags.IFD.Exif)
+    if ExifTags.IFD.Interop in photo:
+        photo = {**photo, ExifTags.IFD.Interop: exif.get_ifd(ExifTags.IFD.Interop)}
+    return {ExifTags.IFD.Exif: photo, ExifTags.IFD.GPSInfo: exif.get_ifd(ExifTags.IFD.GPSInfo)}
+
+
+def exif_directories(data: bytes, head: bytes) -> "dict[int, ImageFileDirectory_v2]":
+    """Exposure and place of an EXIF block, by their tags, as directories of a TIFF file with such a head."""
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    exif, made = Image.Exif(), {}
+    exif.load(data)
+    for block, tags in exif_blocks(exif).items():
+        if tags:
+            made[block] = ImageFileDirectory_v2(head, group=block)
+            made[block].update(tags)
+    return made
 
 
 def _edited(data: bytes, edit: Callable[[Image.Exif], object]) -> bytes:

@@ -7,6 +7,7 @@ process that this runs in decides what becomes of them, since Python's filters a
 """
 
 import os
+import re
 import stat
 import struct
 import zlib
@@ -67,6 +68,13 @@ _FORMATS = {
     **dict.fromkeys((b"P1", b"P2", b"P3", b"P4", b"P5", b"P6"), "PIL.PpmImagePlugin:PpmImageFile"),
 }
 
+# Pillow's words for how the pixels of 16 bits are stored, and the byte of other formats that tells of their bits.
+_DEEP_PIECES = {"PNG": "16", "PPM": "65535"}
+_DEPTH_IN_HEADER = {
+    "AVIF": re.compile(rb"av1C..(.)", re.DOTALL),
+    "JPEG2000": re.compile(rb"\xff\x4f\xff\x51.{38}(.)", re.DOTALL),
+}
+_MAX_HEADER = 2**21
 _BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
 _MAX_MAGIC = max(map(len, _FORMATS))
 _NAMES = "JPEG, PNG, TIFF, WebP, AVIF, HEIC, BMP, TGA, GIF, JPEG 2000, PBM, PGM, PPM"
@@ -149,11 +157,21 @@ def opened_image(file: Path) -> Iterator[ImageFile.ImageFile]:
 
 
 def stored_bits(image: Image.Image) -> int:
-    """Bits per sample as stored; Pillow shows 16-bit colour PNG as 8-bit."""
+    """Bits per sample as stored; Pillow shows deep colours as 8-bit."""
     pieces = getattr(image, "tile", None)
-    if image.format == "PNG" and pieces and "16" in str(pieces[0][3]):
+    if pieces and _DEEP_PIECES.get(image.format or "", "none") in str(pieces[0][3]):
         return 16
-    return _BIT_DEPTHS.get(image.mode, 8)
+    if image.format == "HEIF":
+        return int(image.info["bit_depth"])
+    stream, pattern = getattr(image, "fp", None), _DEPTH_IN_HEADER.get(image.format or "")
+    if stream is None or pattern is None:
+        return _BIT_DEPTHS.get(image.mode, 8)
+    place = stream.tell()
+    stream.seek(0)
+    found = pattern.search(stream.read(_MAX_HEADER))
+    stream.seek(place)
+    kind = 0 if found is None else found[1][0]
+    return 8 + 2 * (kind >> 6 & 1) + 2 * (kind >> 5 & 1) if image.format == "AVIF" else 1 + (kind & 0x7F)
 
 
 def has_late_metadata(file: Path) -> bool:

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import ExifTags, Image, UnidentifiedImageError
 
+from rdstitch.io.exif import exif_blocks
 from rdstitch.io.opening import reader_package
 
 _BITS = 16
 _ORIENTATIONS = {0: 1, 1: 2, 2: 4, 3: 3, 4: 5, 5: 8, 6: 6, 7: 7}  # EXIF's, by what LibRaw calls flip
 _KEPT_TAGS = {int(getattr(ExifTags.Base, name)) for name in ("Make", "Model", "Artist", "Copyright", "DateTime")}
-_KEPT_BLOCKS = (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo)
 
 
 def own_exif(exif: Image.Exif) -> Image.Exif:
@@ -24,8 +24,8 @@ def own_exif(exif: Image.Exif) -> Image.Exif:
     kept = Image.Exif()
     for tag in set(exif) & _KEPT_TAGS:
         kept[tag] = exif[tag]
-    for ifd in _KEPT_BLOCKS:
-        kept.get_ifd(ifd).update(exif.get_ifd(ifd))
+    for tag, block in exif_blocks(exif).items():
+        kept.get_ifd(tag).update(block)
     return kept
 
 

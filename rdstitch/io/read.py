@@ -4,7 +4,9 @@ import math
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import simplejpeg
 from PIL import Image
@@ -14,11 +16,11 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turned
 from rdstitch.io.colour import without_inks
 from rdstitch.io.metadata import GREY_16, Metadata, is_grey, is_transparent, metadata_of, read_metadata
-from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image
+from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image, reader_package
 from rdstitch.io.raw import read_raw
 from rdstitch.io.read_tiff import as_opacity, first_image_pages, read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
-from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME, as_alpha
+from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME, as_alpha, split_alpha
 from rdstitch.system.file_access import open_regular, read_beginning
 from rdstitch.system.late_imports import imagecodecs, tifffile
 
@@ -52,9 +54,9 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
     """Read an image file.
 
     JPEG, PNG, TIFF, WebP and whatever else Pillow reads, with 8 or 16 bit or floating-point samples; with optional
-    packages also HEIC, and raw files, which become 16-bit sRGB. Of an animated or multi-page file the first image
-    counts. CMYK (by its profile), CIELAB and palette colours become RGB. NaN or infinite samples of a floating-point
-    file become transparent zeros.
+    packages also HEIC, and raw files, which become 16-bit sRGB. 10 and 12 bits become 16. Of an animated or multi-page
+    file the first image counts. CMYK (by its profile), CIELAB and palette colours become RGB. NaN or infinite samples
+    of a floating-point file become transparent zeros.
 
     Blocks of ``reduction`` pixels a side become one pixel, the last ones of what is there of them; the metadata stay
     those of the whole image. JPEG files are decoded at 1/2, 1/4 or 1/8 of the size, in a fraction of the time.
@@ -72,9 +74,8 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
         else:
             with opened_image(file) as opened:
                 metadata = metadata or metadata_of(opened)
-                if magic == PNG_MAGIC and metadata.bit_depth == 16 and opened.mode not in GREY_16:
-                    # Pillow would cut 16-bit colour to 8.
-                    samples, alpha = _split(imagecodecs.png_decode(read_beginning(file, _most_bytes(opened.size))))
+                if metadata.bit_depth > 8 and opened.mode in ("RGB", "RGBA", "LA"):
+                    samples, alpha = split_alpha(_deep_samples(file, opened, metadata.bit_depth))
                 else:
                     factor, decoded = _decoder_reduction(opened, metadata, reduction), None
                     if opened.format in _JPEG and opened.mode in ("L", "RGB"):
@@ -82,6 +83,24 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
                     samples, alpha = from_pillow(opened, factor) if decoded is None else (decoded, None)
         image = as_image(file, samples, alpha, metadata or read_metadata(file))
         return reduced(replace(image, damage=damage), reduction // factor)
+
+
+def _deep_samples(file: Path, image: Image.Image, bits: int) -> AnyArray:
+    """Colours of more than 8 bits, which Pillow would cut to 8, in 16."""
+    samples: Any
+    if image.format == "HEIF":
+        with open_regular(file) as stream:
+            package = reader_package("pillow_heif", file)
+            samples = np.asarray(package.open_heif(stream, convert_hdr_to_8bit=False)) >> (16 - bits)
+    else:
+        data = read_beginning(file, _most_bytes(image.size))
+        if image.format == "PPM":
+            samples = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))[..., ::-1]
+        elif image.format == "AVIF":
+            samples = imagecodecs.avif_decode(data, index=0)
+        else:
+            samples = (imagecodecs.png_decode if image.format == "PNG" else imagecodecs.jpeg2k_decode)(data)
+    return np.asarray(samples << (16 - bits) | samples >> (2 * bits - 16))
 
 
 def reduced(image: DecodedImage, factor: int) -> DecodedImage:
@@ -165,13 +184,6 @@ def _samples(image: Image.Image) -> AnyArray:
         bottom = min(top + ROWS_AT_A_TIME, height)
         samples[top:bottom] = np.asarray(image.crop((0, top, width, bottom)))
     return samples
-
-
-def _split(samples: AnyArray) -> tuple[AnyArray, AnyArray | None]:
-    """Grey or colours, and alpha, of an array (h, w, 2) or (h, w, 4); any other as it is."""
-    if samples.ndim == 2 or samples.shape[2] == 3:
-        return samples, None
-    return (samples[..., 0] if samples.shape[2] == 2 else samples[..., :3]), samples[..., -1]
 
 
 def _read_tiff(file: Path) -> tuple[AnyArray, AnyArray | None]:

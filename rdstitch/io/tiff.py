@@ -2,8 +2,7 @@
 
 Grey samples with alpha are something that OpenCV (4.11 to 5.0) reads as stripes or reduces to 8 bits, and that Pillow
 does not read where they are deeper; their transparency is a mask on a page of its own, as GDAL writes it, and every
-program reads the first page. Where there are overviews, the file is in the order of a Cloud Optimized GeoTIFF
-(:mod:`rdstitch.io.tiff_order`).
+program reads the first page. The file is in the order of a Cloud Optimized GeoTIFF (:mod:`rdstitch.io.tiff_order`).
 """
 
 from collections.abc import Iterable, Iterator
@@ -31,7 +30,7 @@ MIN_OVERVIEW = 256  # pixels along the longer side: smaller images need no overv
 _REDUCED, _MASK = 1, 4  # kinds of pages (NewSubfileType)
 _BIGTIFF_FROM = 2**32 - 2**27
 _GDAL_METADATA = 42112
-_COPIED_TAGS = (ExifTags.Base.Make, ExifTags.Base.Model, ExifTags.Base.Artist, ExifTags.Base.Copyright)
+_COPIED_TAGS = tuple(getattr(ExifTags.Base, name) for name in ("Make", "Model", "DateTime", "Artist", "Copyright"))
 
 # (code, type, count, value, only on the first page), as tifffile takes them.
 ExtraTag = tuple[int, int, int, Any, bool]
@@ -69,7 +68,7 @@ def write_tiff(
                     iter(mask), shape=size[::-1], photometric="mask", **how, metadata=None, subfiletype=kind | _MASK
                 )
                 mask.clear()
-    return put_in_order(path) if len(sizes) > 1 else []
+    return put_in_order(path, spec.metadata.exif)
 
 
 def written_strips(path: Path) -> Iterator[Strip]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rdstitch.compositing.tables import CompositeTables
 from rdstitch.inputs.frame import to_channel_order
+from rdstitch.io.samples import split_alpha
 from rdstitch.options.composite_options import Interpolation
 from rdstitch.results.stitch_result import OutputImage
 from rdstitch.system.native_threads import one_native_thread
@@ -65,14 +66,14 @@ class Composer:
         ----------
         images : iterable of ndarray of shape (h, w) or (h, w, C)
             One for each of :attr:`names`, of its size; uint8, uint16 or float32, channels in the order of the
-            result's images.
+            result's images. Alpha, the last of two or four channels, is left out.
 
         Raises
         ------
         ArgumentError
             When number, size or kind of the images is another.
         """
-        given = [np.asarray(image) for image in images]
+        given = [split_alpha(np.asarray(image))[0] for image in images]
         self._tables.check(given)
         return to_channel_order(
             self._tables.compose([to_channel_order(image, self._order) for image in given]), self._order

@@ -172,6 +172,19 @@ def test_what_does_not_fit_is_refused(six: Scene) -> None:
         tables.compose([frame.astype(np.int32) for frame in six.frames])
 
 
+@pytest.mark.parametrize("grey", [False, True])
+def test_a_composer_takes_images_with_alpha_as_the_result_does(grey: bool) -> None:
+    frames = [frame[..., 0] if grey else frame for frame in render(2, 1, seed=4).frames]
+    frames[1] = (frames[1] * 0.6).astype(np.uint8)
+    clear = [np.dstack([frame, np.full(frame.shape[:2], 255, np.uint8)]) for frame in frames]
+    result = pano(clear, options=StitchOptions(composite=CompositeOptions(exposure="gain")))
+    composer = Composer(result)
+    found = composer.compose(clear)
+    np.testing.assert_array_equal(found, composer.compose(frames))
+    assert found.shape == result.image.shape
+    assert np.abs(found.astype(float) - result.image)[composer.alpha > 0].mean() < 3.0
+
+
 def test_a_composer_by_a_result_and_by_its_sidecar(tmp_path: Path) -> None:
     six = render(2, 1, seed=4)
     images = [np.ascontiguousarray(frame[..., ::-1]) for frame in six.frames]

@@ -11,15 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import imagecodecs
 import numpy as np
 import pytest
 import tifffile
+from numpy.typing import NDArray
 from PIL import ExifTags, Image, features
 from PIL.PngImagePlugin import PngInfo
 
 from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turned
 from rdstitch.inputs.find import find_images
+from rdstitch.inputs.frame import Frame, as_inputs
 from rdstitch.io import read as reading
 from rdstitch.io.deepzoom import MAX_TILE_PROFILE
 from rdstitch.io.metadata import MAX_PROFILE, read_metadata
@@ -162,6 +165,41 @@ def test_formats_of_phones_in_a_folder(tmp_path: Path, suffix: str) -> None:
         assert metadata.focal_px == pytest.approx(26 / np.hypot(36, 24) * np.hypot(128, 96))
     assert image.pixels.dtype == np.uint8
     assert np.abs(image.pixels.astype(float) - np.asarray(_smooth())).mean() < 4.0
+
+
+def _write_deep(file: Path, samples: NDArray[np.uint16]) -> None:
+    """Samples of the bits that a file of this name holds, without loss where it can do that."""
+    if file.suffix == ".heic":
+        heif = pytest.importorskip("pillow_heif")
+        mode = "RGBA;16" if samples.shape[2] == 4 else "RGB;16"
+        heif.from_bytes(mode, samples.shape[1::-1], samples.tobytes()).save(file, quality=100, chroma=444)
+    elif file.suffix == ".ppm":
+        assert cv2.imwrite(str(file), samples[..., ::-1])
+    elif file.suffix == ".avif":
+        file.write_bytes(imagecodecs.avif_encode(samples >> 6, level=100, bitspersample=10))
+    else:
+        file.write_bytes(imagecodecs.jpeg2k_encode(samples, level=0, codecformat=file.suffix[1:]))
+
+
+@pytest.mark.parametrize(("suffix", "channels", "bits"), [(".heic", 3, 10), (".heic", 4, 10), (".avif", 3, 10),
+                         (".avif", 4, 10), (".jp2", 3, 16), (".j2k", 3, 16), (".ppm", 3, 16)])  # fmt: skip
+def test_deep_colours_are_read_in_full(tmp_path: Path, suffix: str, channels: int, bits: int) -> None:
+    samples = np.linspace(0, 65535, 96 * 128).astype(np.uint16).reshape(96, 128, 1).repeat(channels, 2)
+    samples[:48, :, 1:] = samples[48:, ::-1, 1:]
+    _write_deep(tmp_path / f"a{suffix}", samples)
+    image = read_image(tmp_path / f"a{suffix}")
+    assert (image.metadata.bit_depth, image.metadata.channels) == (bits, channels)
+    assert image.pixels.dtype == np.uint16
+    shown = image.pixels if channels == 3 else image.pixels[image.alpha > 200]
+    error = np.abs(shown.astype(int) - (samples if channels == 3 else samples[image.alpha > 200])[..., :3])
+    assert error.max() < 65536 * 5 / 2**bits
+    assert image.pixels.max() == 65535
+    if suffix != ".heic":
+        with Image.open(tmp_path / f"a{suffix}") as opened:
+            [frame] = as_inputs(opened)
+        assert isinstance(frame, Frame)
+        assert frame.decoded().pixels.dtype == np.uint8
+        assert frame.decoded().metadata.bit_depth == 8
 
 
 def test_raw_files(tmp_path: Path) -> None:

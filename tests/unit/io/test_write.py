@@ -150,6 +150,53 @@ def test_profile_and_exif_are_kept(tmp_path: Path, suffix: str) -> None:
         assert back.dpi == pytest.approx((150, 150), abs=0.02)
 
 
+def _photo() -> bytes:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Model], exif[ExifTags.Base.DateTime] = "Model", "2020:01:02 03:04:05"
+    tag = ExifTags.Base
+    exif.get_ifd(ExifTags.IFD.Exif).update({tag.ExposureTime: 0.004, tag.FNumber: 2.8, tag.ISOSpeedRatings: 100})
+    exif.get_ifd(ExifTags.IFD.Exif).update({tag.DateTimeOriginal: "2020:01:02 03:04:05", tag.FocalLengthIn35mmFilm: 36})
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.IFD.Interop] = {1: "R03"}
+    exif.get_ifd(ExifTags.IFD.GPSInfo).update({1: "N", 2: (41.0, 25.0, 43.5), 3: "W", 4: (81.0, 36.0, 21.25), 6: 250.5})
+    return exif.tobytes()
+
+
+@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
+@pytest.mark.parametrize(("large", "shape"), [(False, (400, 600, 3)), (True, (400, 600, 3)), (False, (40, 60))])
+def test_tiff_says_what_jpeg_says_of_camera_time_and_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, large: bool, shape: tuple[int, ...]
+) -> None:
+    if large:
+        monkeypatch.setattr("rdstitch.io.tiff._BIGTIFF_FROM", 0)
+    pixels = np.random.default_rng(0).integers(0, 255, shape, np.uint8)
+    for name in ("a.tif", "a.jpg"):
+        write_image(tmp_path / name, pixels, metadata=Metadata((shape[1], shape[0]), exif=_photo()))
+    tiff, jpeg = (read_image(tmp_path / name).metadata for name in ("a.tif", "a.jpg"))
+    assert tiff.gps is not None
+    for field in ("focal_px", "gps", "timestamp", "exposure", "model"):
+        assert getattr(tiff, field) == getattr(jpeg, field) is not None, field
+    with Image.open(tmp_path / "a.tif") as by_pillow, Image.open(tmp_path / "a.jpg") as photo:
+        blocks = [
+            [dict(image.getexif().get_ifd(block)) for block in (ExifTags.IFD.GPSInfo, ExifTags.IFD.Interop)]
+            for image in (by_pillow, photo)
+        ]
+        assert blocks[0] == blocks[1]
+        np.testing.assert_array_equal(np.asarray(by_pillow), pixels)
+    with tifffile.TiffFile(tmp_path / "a.tif") as by_tifffile:
+        tags = by_tifffile.pages.first.tags
+        assert [tag.code for tag in tags] == sorted(tag.code for tag in tags)
+        assert tags["ExifTag"].value["FocalLengthIn35mmFilm"] == 36
+        assert tags["DateTime"].value == tags["ExifTag"].value["DateTimeOriginal"] == "2020:01:02 03:04:05"
+        assert tags["GPSTag"].value["GPSLatitudeRef"] == "N"
+    by_opencv = cv2.imread(str(tmp_path / "a.tif"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(by_opencv[..., ::-1] if len(shape) == 3 else by_opencv, pixels)
+    with pytest.importorskip("rasterio").open(tmp_path / "a.tif") as by_gdal:
+        np.testing.assert_array_equal(np.moveaxis(by_gdal.read(), 0, -1).reshape(shape), pixels)
+        # GDAL reads EXIF of no BigTIFF.
+        assert large or by_gdal.tags(ns="EXIF")["EXIF_DateTimeOriginal"] == "2020:01:02 03:04:05"
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["a.jpg", "a.tif"]
+
+
 def test_tiff_has_overviews_of_half_the_size(tmp_path: Path) -> None:
     pixels = _image(1301, 1003, 3, np.uint8)
     alpha = np.full(pixels.shape[:2], 255, np.uint8)
