@@ -186,8 +186,10 @@ def _compare_bands(saved: SavedRegistration, used: Mapping[int, Source], progres
                 pairs[index] = replace(read[0], camera=camera), used[index]
     lens = band_lens(pairs, lambda done, total: progress("comparing bands", done, total))
     if lens is None and pairs:
-        text = "the given images show nothing that the registered ones do: whether the same lens took them is not known"
-        return _not_compared(saved, text)
+        text = (
+            "the given images show nothing that the registered ones do: whether the same lens took them, from the same "
+        )
+        return _not_compared(saved, f"{text}places (see --match), is not known")
     if lens is None or lens.is_same:
         return _BandComparison()
     text = f"{lens.shift:.1f} pixels (median) from the registered band, {lens.error:.1f} with its lens registered too"

@@ -174,6 +174,17 @@ def test_another_band_in_order(rdstitch: Run, frames: list[Path], stitched: Path
     _apply(rdstitch, _sidecar(stitched), band, tmp_path / "n.tif", "--match", "name", status=3, told=frames[0].name)
 
 
+def test_numbers_that_begin_elsewhere_are_no_names(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
+    registered = _written(frames, tmp_path / "red", [f"V{k:02}_RED.png" for k in (0, 1, 2)])
+    rdstitch("mosaic", registered, "-o", tmp_path / "r.png", *CACHED)
+    shifted = _written(frames, tmp_path / "nir", [f"V{k:02}_NIR.png" for k in (1, 2, 3)], band=1)
+    sidecar, output = tmp_path / "r.png.json", tmp_path / "n.png"
+    _apply(rdstitch, sidecar, shifted, output, status=3, told="V02_NIR.png takes its place in order; say which holds")
+    _apply(rdstitch, sidecar, shifted, output, "--match", "order", err="")
+    fewer = _written(frames[1:], tmp_path / "fewer", [f"V{k:02}_NIR.png" for k in (1, 2)], band=1)
+    _apply(rdstitch, sidecar, fewer, output, "--overwrite", told="V00_RED.png")
+
+
 def test_originals_are_found_from_the_folder_of_the_sidecar(
     frames: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -51,7 +51,7 @@ def find_counterparts(saved: SavedRegistration, frames: Sequence[Frame], match: 
         chosen = [frame if image.used else None for image, frame in zip(saved.images, of_all, strict=True)]
         if any(frame is not None for frame in chosen):
             if matched == "name" and match == "auto":
-                _refuse_other_flights(saved, chosen)
+                _refuse_other_flights(saved, chosen, frames)
             return Counterparts(chosen, matched, _without_counterpart(of_all, frames))
     for path in files_of(frames):
         check_readable(path)
@@ -90,16 +90,32 @@ def _by_name(saved: SavedRegistration, frames: Sequence[Frame], key: Callable[[P
     return chosen
 
 
-def _refuse_other_flights(saved: SavedRegistration, chosen: Chosen) -> None:
-    """Refuse equal names of another flight, since cameras restart numbering, by times or else positions."""
-    frames = [frame for frame in chosen if frame is not None]
-    near = next(filter(None, (_by_measurement(saved, frames, by) for by in (_times, _places))), chosen)
-    for image, by_name, by_place in zip(saved.images, chosen, near, strict=True):
-        if by_name is not None and by_place is not None and by_name is not by_place:
+def _refuse_other_flights(saved: SavedRegistration, chosen: Chosen, frames: Sequence[Frame]) -> None:
+    """Refuse equal names of another flight, or numbers that begin elsewhere, by times, or positions, or else order."""
+    named = [frame for frame in chosen if frame is not None]
+    measured = next(filter(None, (_by_measurement(saved, named, by) for by in (_times, _places))), None)
+    others = measured or _by_shifted_number(saved, frames) or chosen
+    for image, by_name, other in zip(saved.images, chosen, others, strict=True):
+        if by_name is not None and other is not None and by_name is not other:
+            why = "was taken at the time or place of that" if measured else "takes its place in order"
             raise InputError(
-                f"{by_name.path}: has the name or number of {image.name}, but {by_place.path.name} was taken at the "
-                "time or place of that; say which holds: --match name, or --match order"
+                f"{by_name.path}: has the name or number of {image.name}, but {other.path.name} {why}; "
+                "say which holds: --match name, or --match order"
             )
+
+
+def _by_shifted_number(saved: SavedRegistration, frames: Sequence[Frame]) -> Chosen | None:
+    """Match by numbers in the names that are all higher, or lower, by the same; None where they are not."""
+    registered = _varying_parts([image.name for image in saved.images])
+    given = _varying_parts([without_query(frame.path).name for frame in frames])
+    if registered is None or given is None or len(registered) != len(given):
+        return None
+    if not all(len(part) == 1 and part[0].isdecimal() for part in registered + given):
+        return None
+    ours, theirs = ([int(number) for (number,) in parts] for parts in (registered, given))
+    frame_of, shift = dict(zip(theirs, frames, strict=True)), min(theirs) - min(ours)
+    chosen = [frame_of.get(number + shift) for number in ours]
+    return chosen if all(chosen) else None
 
 
 def _folders(frame: Frame) -> list[str]:
