@@ -217,10 +217,7 @@ def _factory(file: Path, stream: BinaryIO) -> Any:
             return resolve_name(reader)
     if beginning[4:8] == b"ftyp":
         if beginning[8:12] in (b"avif", b"avis"):
-            try:
-                return resolve_name("PIL.AvifImagePlugin:AvifImageFile")
-            except ImportError:
-                raise InputError(f"{file}: AVIF needs Pillow 11.3 or newer; or convert it to JPEG or TIFF") from None
+            return resolve_name("PIL.AvifImagePlugin:AvifImageFile")
         # No opener is registered with Pillow, since that would be for the whole process.
         return reader_package("pillow_heif", file).HeifImageFile
     if file.suffix.lower() == ".tga":  # has no magic
