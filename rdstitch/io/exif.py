@@ -189,9 +189,11 @@ def _edited(data: bytes, edit: Callable[[Image.Exif], object]) -> bytes:
 
 
 def _written(exif: Image.Exif) -> bytes:
-    """An EXIF block; its text keeps its bytes, of which Pillow, who reads them as Latin-1, writes ASCII only."""
-    for tags in (exif, *map(exif.get_ifd, (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo))):
-        tags.update({tag: text.encode("latin-1") for tag, text in tags.items() if isinstance(text, str)})
+    """An EXIF block; author and the like keep their bytes: Pillow reads them as Latin-1, but writes ASCII only."""
+    # Only what is not ASCII, and not of the blocks: Pillow does not know that bytes are text there.
+    exif.update(
+        {tag: text.encode("latin-1") for tag, text in exif.items() if isinstance(text, str) and not text.isascii()}
+    )
     return exif.tobytes()
 
 

@@ -183,6 +183,7 @@ class TestMetadata:
     def test_names_keep_their_bytes(self, tmp_path: Path, suffix: str, coding: str) -> None:
         author, exif = "© Jürgen Müller".encode(coding), Image.Exif()
         exif[0x013B] = exif[0x8298] = author
+        exif.get_ifd(ExifTags.IFD.Exif)[0x9003] = time = "2020:01:01 10:00:00"
         Image.new("L", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
         metadata = read_metadata(tmp_path / "a.jpg")
         for written in (metadata, metadata.of_composite()):
@@ -190,6 +191,7 @@ class TestMetadata:
             with Image.open(tmp_path / f"b.{suffix}") as image:
                 tags = image.getexif()
             assert [tags[tag].encode("latin-1") for tag in (0x013B, 0x8298)] == [author, author]
+            assert suffix == "ome.tif" or tags.get_ifd(ExifTags.IFD.Exif)[0x9003] == time
 
     def test_place_and_attitude(self, tmp_path: Path) -> None:
         exif = Image.Exif()
