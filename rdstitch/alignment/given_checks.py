@@ -76,20 +76,21 @@ def _contradiction(
     shown: "_ShownTilts", given: FloatArray, options: AlignmentOptions
 ) -> tuple[AlignmentOptions, Message] | None:
     """What replaces the options where the images contradict the given tilts (N, 2), radians, or their accuracy."""
-    stated = options.attitudes_std if options.attitudes is not None else 0.0
-    # The largest log likelihood and its scatter of tilts as given, with other signs or order, and of none.
+    if options.attitudes is None:  # one tilt for all, against the one that they show
+        common = np.median(shown.tilts, axis=0)
+        as_shown, as_given = (shown.best_scatter(np.broadcast_to(tilt, given.shape))[0] for tilt in (common, given[0]))
+        contradicted = as_shown >= as_given + _LOG_ODDS
+        return (_without_tilts(options), sentences.tilt_contradicted(given[0], common)) if contradicted else None
+    stated = options.attitudes_std
+    # The largest log likelihood and its scatter of attitudes as given, with other signs or order, and of none.
     changed = [shown.best_scatter(given @ change.T) for change in _SIGNED_ORDERS]
     (as_given, scatter), likeliest = changed[0], max(range(len(changed)), key=lambda k: changed[k][0])
     (as_changed, scatter_changed), (without_any, _) = changed[likeliest], shown.best_scatter(np.zeros_like(given))
     if as_given - shown.log_likelihood(given, stated) < _LOG_ODDS or scatter <= stated:
         return None
     if max(as_changed, without_any) >= as_given + _LOG_ODDS:
-        if options.attitudes is None:
-            return _without_tilts(options), sentences.tilt_contradicted(given[0], np.median(shown.tilts, axis=0))
         change = _SIGNED_ORDERS[likeliest] if as_changed > without_any + _LOG_ODDS else None
         return _without_tilts(options), sentences.attitudes_contradicted(scatter, change, max(scatter_changed, _EXACT))
-    if options.attitudes is None:
-        return None
     return replace(options, attitudes_std=scatter), sentences.attitudes_scatter(scatter, stated)
 
 

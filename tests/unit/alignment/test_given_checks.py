@@ -83,8 +83,11 @@ def test_attitudes_that_say_less_than_their_scatter_are_no_contradiction() -> No
     assert _aligned(given, rng.normal(scale=_ONE, size=(12, 2)), _ONE).messages == ()
 
 
-@pytest.mark.parametrize(("tilt", "right"), [((0.05, -0.03), True), ((-0.05, 0.03), False), ((0.05, 0.03), False)])
-def test_a_tilt_of_the_wrong_sign_is_not_used(tilt: tuple[float, float], right: bool) -> None:
+@pytest.mark.parametrize(
+    ("tilt", "right"),
+    [((0.05, -0.03), True), ((-0.05, 0.03), False), ((0.05, 0.03), False), ((0.02, 0.02), False), ((0.0, 0.0), False)],
+)
+def test_a_wrong_tilt_is_not_used(tilt: tuple[float, float], right: bool) -> None:
     given = grid_scene(4, 3, (0.5, 0.4), 0.3, seed=5, tilt=(0.05, -0.03), per_link=80)
     found = aligned(given, lens="division", tilt=tilt)
     assert (found.messages == ()) == right
