@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
-from PIL import Image, PngImagePlugin
+from PIL import ExifTags, Image, PngImagePlugin
 
 from rdstitch.geometry.camera import Camera
 from rdstitch.geometry.lens_model import LensModel
@@ -190,8 +190,8 @@ class TestMetadata:
             write_image(tmp_path / f"b.{suffix}", np.zeros((8, 8), np.uint8), metadata=written)
             with Image.open(tmp_path / f"b.{suffix}") as image:
                 tags = image.getexif()
-            assert [tags[tag].encode("latin-1") for tag in (0x013B, 0x8298)] == [author, author]
-            assert suffix == "ome.tif" or tags.get_ifd(ExifTags.IFD.Exif)[0x9003] == time
+                assert [tags[tag].encode("latin-1") for tag in (0x013B, 0x8298)] == [author, author]
+                assert suffix == "ome.tif" or tags.get_ifd(ExifTags.IFD.Exif)[0x9003] == time
 
     def test_place_and_attitude(self, tmp_path: Path) -> None:
         exif = Image.Exif()
