@@ -88,10 +88,12 @@ def _contradiction(
     (as_changed, scatter_changed), (without_any, _) = changed[likeliest], shown.best_scatter(np.zeros_like(given))
     if as_given - shown.log_likelihood(given, stated) < _LOG_ODDS or scatter <= stated:
         return None
+    named = "the attitudes plus the given tilt" if any(options.tilt or ()) else "the attitudes"
     if max(as_changed, without_any) >= as_given + _LOG_ODDS:
         change = _SIGNED_ORDERS[likeliest] if as_changed > without_any + _LOG_ODDS else None
-        return _without_tilts(options), sentences.attitudes_contradicted(scatter, change, max(scatter_changed, _EXACT))
-    return replace(options, attitudes_std=scatter), sentences.attitudes_scatter(scatter, stated)
+        scatters = scatter, change, max(scatter_changed, _EXACT)
+        return _without_tilts(options), sentences.attitudes_contradicted(named, *scatters)
+    return replace(options, attitudes_std=scatter), sentences.attitudes_scatter(named, scatter, stated)
 
 
 def _fit_without_tilts(problem: Problem, options: AlignmentOptions) -> tuple[Problem, Fit] | None:

@@ -34,9 +34,9 @@ def attitudes_late(delay: float, std: float) -> Message:
     return Message(text, severity="note", code="attitudes-late")
 
 
-def attitudes_scatter(scatter: float, stated: float) -> Message:
+def attitudes_scatter(attitudes: str, scatter: float, stated: float) -> Message:
     """Of attitudes that scatter more than was stated, radians."""
-    text = f"the attitudes agree with the images to {math.degrees(scatter):.2g} degrees, which is taken for their "
+    text = f"{attitudes} agree with the images to {math.degrees(scatter):.2g} degrees, which is taken for their "
     return Message(f"{text}standard deviation instead of {math.degrees(stated):.2g}", severity="note")
 
 
@@ -47,9 +47,11 @@ def tilt_contradicted(given: FloatArray, shown: FloatArray) -> Message:
     return Message(text, code="attitudes-contradicted")
 
 
-def attitudes_contradicted(scatter: float, change: FloatArray | None, scatter_changed: float) -> Message:
+def attitudes_contradicted(
+    attitudes: str, scatter: float, change: FloatArray | None, scatter_changed: float
+) -> Message:
     """Of attitudes that scatter by so much, radians, and by less with other signs or order (2, 2), if these help."""
-    text = f"the images contradict the attitudes by {math.degrees(scatter):.1f} degrees; they are not used: "
+    text = f"the images contradict {attitudes} by {math.degrees(scatter):.1f} degrees; they are not used: "
     if change is None:
         text += "no signs and no order of psi and theta make them fit"
     else:

@@ -58,7 +58,7 @@ class StitchOptions(RansacOptions, RunOptions):
     )
     tilt: tuple[float, float] | None = option(
         None,
-        "Known tilt of the camera, {unit}.",
+        "Known tilt of the camera, {unit}; with --attitude, that of its mount, added to each.",
         "PSI,THETA",
         within=Range(above=-math.pi / 2, below=math.pi / 2),
         unit=Unit.RADIANS,

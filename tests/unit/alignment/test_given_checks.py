@@ -71,6 +71,15 @@ def test_wrong_signs_and_orders_are_named_and_not_used(
     np.testing.assert_array_equal(found.homographies, plain.homographies)
 
 
+def test_a_tilt_beside_attitudes_is_that_of_the_mount(windy: tuple[Scene, FloatArray]) -> None:
+    given, measured = windy
+    mount = (0.06, -0.04)
+    right = aligned(given, lens="division", tilt=mount, attitudes=measured - mount, attitudes_std=math.radians(0.2))
+    assert right.messages == ()
+    twice = aligned(given, lens="division", tilt=mount, attitudes=measured, attitudes_std=0.0)
+    assert "the attitudes plus the given tilt" in twice.messages[0].text
+
+
 def test_attitudes_of_other_images_are_not_used(windy: tuple[Scene, FloatArray]) -> None:
     given, measured = windy
     (message,) = _aligned(given, np.roll(measured, 5, axis=0), math.radians(0.2)).messages
