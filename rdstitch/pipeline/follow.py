@@ -137,6 +137,10 @@ class Tracker:
         for file in tables:  # before the first frame, not at each
             if file is not None and file != XMP and not Path(file).is_dir():
                 check_readable(Path(file))
+        read_later = (self._options.timestamps, self._options.positions, self._options.gcp, self._options.check_points)
+        for file in read_later:  # they may grow as frames arrive, but must be there
+            if file is not None and not Path(file).exists():
+                check_readable(Path(file))
         # Of frames that have been made ready.
         features = replace(self._detection, work_megapixels=None, stretch=None, equalize=False)
         in_subprocess = (self._options.threads > 1 or not patient) and bool(sys.executable)

@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -91,7 +91,8 @@ def tiles(
     run = Run.of(given, output, FilesBeside.of(ImageFiles, beside, "tiles"), progress)
     with given.find_images(run.output) as images, run.outputs:
         files = _checked_files(images, run, options, positions_file)
-        _, registration = _register(images, run, options, files, positions_file)
+        registration = _register(images, run, options, files)
+        _write_beside(registration, run.outputs, positions_file, options)
         with run.executor(len(registration.sources)) as executor:
             chosen = lay_out(registration, no_local_alignment("tiles on a stage"), run.options.compositing)
             return compose_registration(chosen, run, files, executor)
@@ -130,7 +131,10 @@ def place_tiles(
     run = Run.of(given, progress=progress)
     with given.find_images() as images, run.outputs:
         files = _checked_files(images, run, options, positions_file)
-        return _register(images, run, options, files, positions_file)
+        registration = _register(images, run, options, files)
+        _write_beside(registration, run.outputs, positions_file, options)
+    assert registration.tiles is not None
+    return registration.tiles, registration
 
 
 def _checked_files(
@@ -143,32 +147,39 @@ def _checked_files(
     return files
 
 
-def _register(
-    images: FoundImages, run: Run, options: TileOptions, files: OutputFiles, positions_file: str | Path | None
-) -> tuple[TileRegistration, Registration]:
-    """Register all tiles, and stage the table of their places and the flat field, if wanted."""
+def _register(images: FoundImages, run: Run, options: TileOptions, files: OutputFiles) -> Registration:
+    """Register all tiles that can be read."""
     frames, stored, notes = tile_frames(images.frames, options.z, options.time)
     limit = options.composite.max_memory
     sources, unread = read_sources(frames, skip_bad=not options.strict, guard=run.guard, max_memory=limit)
     files.check_places(sources)
     sources, excluded = _of_one_kind(sources, options.strict)
-    unread += excluded
-    while True:
-        if len(sources) < 2:
-            raise InputError(f"{unread[0].images[0]}: {unread[0].text}" if unread else "name two tiles or more")
-        nominal = _grid(sources, frames, stored, options)
-        try:
-            sources, tiled, messages = _placed(sources, nominal, options, run.progress)
-            break
-        except InputError:
-            sources, damaged = _readable(sources)
-            if options.strict or not damaged:
-                raise
-            unread += damaged
-    tiled = replace(tiled, z=options.z, time=options.time)
-    _write_beside(run.outputs, positions_file, options, sources, tiled)
-    registration = tiles_as_registration(sources, tiled)
-    return tiled, registration.with_messages([*unread, *images.messages, *notes, *messages])
+    missing = [*unread, *excluded]
+    grid_of = partial(_grid, frames=frames, stored=stored, options=options)
+    sources, tiled, messages = _placed_without_unreadable(sources, missing, grid_of, options, run.progress)
+    registration = tiles_as_registration(sources, replace(tiled, z=options.z, time=options.time))
+    return registration.with_messages([*images.messages, *notes, *messages])
+
+
+def _placed_without_unreadable(
+    sources: list[Source],
+    missing: list[Message],
+    grid_of: Callable[[list[Source]], TileGrid],
+    options: TileOptions,
+    progress: Progress,
+) -> tuple[list[Source], TileRegistration, list[Message]]:
+    """Place tiles; where samples of some turn out to be unreadable, without these, which are ``missing`` too then."""
+    if len(sources) < 2:
+        raise InputError(f"{missing[0].images[0]}: {missing[0].text}" if missing else "name two tiles or more")
+    nominal = grid_of(sources)
+    try:
+        placed, tiled, messages = _placed(sources, nominal, options, progress)
+        return placed, tiled, [*missing, *messages]
+    except InputError:
+        readable, unreadable = _readable(sources)
+        if options.strict or not unreadable:
+            raise
+    return _placed_without_unreadable(readable, [*missing, *unreadable], grid_of, options, progress)
 
 
 def _of_one_kind(sources: list[Source], strict: bool) -> tuple[list[Source], list[Message]]:
@@ -226,6 +237,7 @@ def _placed(
     if len(off) > _FEW_WRONG * held:
         names = [sources[k].name for k in off[0].tolist()]
         messages.append(neighbours_contradicted(nominal.source, names, len(off), held))
+    # Tiles without a neighbour are read too: one that cannot be is to be left out now, not fail the composition.
     for index in set(range(len(grid))) - set(tiled.compared.ravel().tolist()):
         read(index)
     field = sources[0].flat_field
@@ -244,13 +256,12 @@ def _overlaps_show(field: FlatField, sources: Sequence[Source], tiled: TileRegis
     return agrees_with_overlaps(field, compared)
 
 
-def _write_beside(
-    outputs: Outputs, file: str | Path | None, options: TileOptions, sources: Sequence[Source], tiled: TileRegistration
-) -> None:
+def _write_beside(registration: Registration, outputs: Outputs, file: str | Path | None, options: TileOptions) -> None:
     """Stage the table of places and the flat field, if wanted."""
+    sources, tiled = registration.sources, registration.tiles
     if options.dry_run:
         return
-    if file is not None:
+    if file is not None and tiled is not None:
         names = [source.name for source in sources]
         places = tiled.adjustment.places - tiled.adjustment.places.min(axis=0)
         fiji = Path(file).suffix.lower() == ".txt"

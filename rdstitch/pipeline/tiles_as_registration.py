@@ -103,6 +103,12 @@ def _messages(sources: Sequence[Source], tiled: TileRegistration) -> tuple[Messa
             f"{named(alone)}"
         )
         messages.append(Message(text, severity="note", code="nominal-places"))
+    if tiled.mostly_nominal:
+        text = (
+            f"{len(alone)} of {len(sources)} tiles have their places from the stage alone: they show nothing, or the "
+            f"places ({tiled.grid.source}) or the overlap are wrong"
+        )
+        messages.append(Message(text, severity="failure", code="nominal-places"))
     if len(tiled.groups) > 1:
         others = [k for group in tiled.groups[1:] for k in group]
         text = (

@@ -86,6 +86,18 @@ def test_tiles_that_show_nothing_are_refused_in_one_line(rdstitch: Run, slide: P
     rdstitch("tiles", slide, *NAMED, status=2)
 
 
+def test_most_tiles_by_the_stage_alone_are_written_with_a_status(rdstitch: Run, slide: Path, tmp_path: Path) -> None:
+    folder, output, rng = tmp_path / "empty", tmp_path / "out.tif", np.random.default_rng(1)
+    folder.mkdir()
+    for file in slide.glob("*.tif"):
+        shown = file.name in ("r00c00.tif", "r00c01.tif")
+        noise = rng.integers(90, 110, (256, 256), dtype=np.uint16)
+        tifffile.imwrite(folder / file.name, tifffile.imread(file) if shown else noise)
+    done = rdstitch("tiles", folder, *NAMED, "--flat-field", "off", "-o", output, status=5)
+    assert "not reliable: 7 of 9 tiles" in done.err
+    assert not sidecar_of(output)["verdict"]["ok"]
+
+
 def test_black_ground_stays(rdstitch: Run, slide: Path, tmp_path: Path) -> None:
     folder, output = tmp_path / "dark", tmp_path / "dark.tif"
     folder.mkdir()

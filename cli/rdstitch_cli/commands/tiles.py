@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import click
 
@@ -14,9 +14,6 @@ from rdstitch.options.tile_options import TileOptions, measured_samples
 from rdstitch_cli.flags import Inputs, PrintSidecar, command, flags_of, values_of
 from rdstitch_cli.stitching import files_beside, report_registration, report_result, resolve
 from rdstitch_cli.terminal import Reporter
-
-if TYPE_CHECKING:
-    from rdstitch.stage import TileRegistration
 
 
 @command(
@@ -76,21 +73,12 @@ def tiles(
     composite = replace(measured_samples(), **values_of(CompositeOptions, given))
     chosen = TileOptions(**values_of(TileOptions, given), composite=composite)
     if output is None:
-        tiled, registration = place_tiles(paths, positions_only, chosen, progress=reporter)
+        _, registration = place_tiles(paths, positions_only, chosen, progress=reporter)
         report_registration(registration, reporter)
         reporter.made(f"{positions_only}: {registration.summary}")
-        _check_placed(tiled)
-        return
-    result = recipe(paths, output, chosen, positions_file=positions_only, progress=reporter, beside=beside)
-    report_result(result, reporter, as_json=as_json)
-    _check_placed(result.registration.tiles)
-
-
-def _check_placed(tiled: "TileRegistration | None") -> None:
-    """End with the status of a partial result where most tiles keep the stage's own places, right or wrong."""
-    if tiled is not None and tiled.mostly_nominal:
-        alone = len(tiled.grid) - int(tiled.linked.sum())
-        raise PartialResultError(
-            f"{alone} of {len(tiled.grid)} tiles have their places from the stage alone: they show nothing, or "
-            f"the places ({tiled.grid.source}) or the overlap are wrong; what could be placed is written"
-        )
+    else:
+        result = recipe(paths, output, chosen, positions_file=positions_only, progress=reporter, beside=beside)
+        registration = result.registration
+        report_result(result, reporter, as_json=as_json)
+    if not registration.ok:
+        raise PartialResultError("most tiles have not been placed by what they show; what could be placed is written")

@@ -8,7 +8,7 @@ from rdstitch.alignment.result import links_by_image
 from rdstitch.choices import ModelName
 from rdstitch.errors import PartialResultError
 from rdstitch.inputs.input_guard import InputGuard
-from rdstitch.pipeline.registration.aligner import Aligner, impossible_estimates_fail
+from rdstitch.pipeline.registration.aligner import Aligner
 from rdstitch.pipeline.registration.realign import Rejected, aligner_of, left_out_images, plane_of_most, without
 from rdstitch.pipeline.registration.working_size import at_full_size
 from rdstitch.pipeline.run import Run
@@ -42,7 +42,6 @@ class _Checked:
         return self.registration.with_messages(messages_of(self.findings, self.registration))
 
 
-@impossible_estimates_fail()
 def accept(registration: Registration, run: Run) -> Registration:
     """The registration of the images that pass all checks, with messages, in pixels of the working size."""
     options, purpose = run.options, run.purpose
@@ -60,7 +59,7 @@ def accept(registration: Registration, run: Run) -> Registration:
     repairs = iter(()) if options.force else _repairs(first, check, undamaged, aligner, options.threads)
     while tried[-1].failures and (repaired := next(repairs, None)) is not None:
         tried.append(repaired)
-    # Of what no repair mends the first failures are told; where nothing is left to blame, the last ones.
+    # If no repair succeeds, report the failures of the first check, or of the last one if they concern the whole.
     last = tried[-1]
     accepted = (last if not last.failures or last.fails_as_whole else first).with_messages()
     if accepted.failures and not options.force:

@@ -111,6 +111,7 @@ class Aligner:
         """Align the images by their registered pairs."""
         return self.completed(self.draft(pairs))
 
+    @impossible_estimates_fail()
     def draft(self, pairs: Sequence[PairRegistration], known: KnownModel | None = None) -> DraftedPairs:
         """Model, lens and poses by a few matches of each pair: what shows which pairs and matches are missing.
 
@@ -125,6 +126,7 @@ class Aligner:
                 aligned = replace(over, pairs=tuple(pairs), rough=True)
         return self.metric(aligned) if self.needs_poses else aligned
 
+    @impossible_estimates_fail()
     def completed(self, draft: DraftedPairs) -> AlignedPairs:
         """The images adjusted to all matches."""
         task = draft.task.task

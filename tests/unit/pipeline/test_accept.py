@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from rdstitch.alignment.frames.quarter_turns import QuarterTurns
 from rdstitch.alignment.result import Unused
 from rdstitch.arrays import FloatArray
 from rdstitch.choices import LensName, Purpose
+from rdstitch.errors import ImpossibleCameraError
 from rdstitch.features import Correspondences, FeatureOptions
 from rdstitch.geometry.camera import Camera
 from rdstitch.io.write import write_image
@@ -72,6 +74,14 @@ def test_what_remains_has_metric_poses_where_they_are_needed(monkeypatch: pytest
     assert free.draft(()).alignment.poses is None
     assert replace(free, needs_poses=True).draft(()).alignment.poses is not None
     assert asked == ["auto", "auto", "pose"]
+
+
+@pytest.mark.parametrize("error", [np.linalg.LinAlgError("singular"), ImpossibleCameraError("folds")])
+def test_an_alternative_that_cannot_be_computed_is_none(monkeypatch: pytest.MonkeyPatch, error: Exception) -> None:
+    monkeypatch.setattr(Aligner, "_drafted", Mock(side_effect=error))
+    aligner = Aligner.of([], OPTIONS, NO_CACHE)
+    assert realigned(registration(), aligner, lambda _: True) is None
+    assert without(registration(), {(0,): "shows something else"}, aligner) is None
 
 
 def test_of_two_motions_that_which_fills_more_of_the_overlaps_is_taken(tmp_path: Path) -> None:

@@ -44,6 +44,17 @@ def _tracker() -> rdstitch.Tracker:
     return rdstitch.Tracker(rdstitch.StitchOptions(distortion=DISTORTION, focal=256.0), rdstitch.FollowedPoses(HEIGHT))
 
 
+@pytest.mark.parametrize("table", ["timestamps", "positions", "gcp", "check_points"])
+def test_a_file_that_does_not_exist_is_refused_before_the_first_frame(table: str, tmp_path: Path) -> None:
+    file = tmp_path / "table.csv"
+    known: dict[str, Any] = {table: file}
+    options = rdstitch.StitchOptions(**known)
+    with pytest.raises(InputError, match=r"table\.csv: no such file"):
+        rdstitch.Tracker(options)
+    file.touch()  # its lines come as the frames do
+    rdstitch.Tracker(options)
+
+
 def test_metric_poses_near_the_truth_and_reasons_for_the_first_frames(drive: RenderedSequence) -> None:
     tracker = _tracker()
     poses: dict[int, rdstitch.Pose] = {}

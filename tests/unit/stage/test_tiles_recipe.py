@@ -71,6 +71,14 @@ def test_a_list_of_positions_that_is_not_there_is_told_before_a_tile_is_read(tmp
     assert not any(item.reads for item in lazy)
 
 
+def test_a_result_of_which_most_tiles_show_nothing_is_not_ok() -> None:
+    noise = np.random.default_rng(1).integers(90, 110, (4, 256, 256)).astype(TILES.dtype)
+    result = rdstitch.tiles([*TILES[:2], *noise], positions=STAGE.nominal, distortion=0.0, flat_field="off")
+    assert not result.ok
+    assert result.verdict.failures[0].startswith("4 of 6 tiles have their places from the stage alone")
+    assert rdstitch.tiles(TILES, positions=STAGE.nominal).ok
+
+
 def test_one_array_of_all_tiles_is_read_tile_by_tile() -> None:
     zarr = pytest.importorskip("zarr")
     result = rdstitch.tiles(zarr.array(TILES, chunks=(1, 256, 256)), positions=STAGE.nominal)
