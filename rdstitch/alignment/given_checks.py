@@ -38,7 +38,9 @@ _WITH_TILTS: list[ModelName] = ["tilting"]
 LATE = 3.0
 """Standard deviations from which on a delay is one."""
 
-_FREE_MOUNT = 1.0  # standard deviation, radians, of a tilt of the mount of which nothing is known
+# Standard deviations, radians, of a tilt of the mount of which nothing is known, and of one that is given: a level
+# shows half a degree, and images whose lens is not quite that of the model are off together by as much.
+_FREE_MOUNT, _GIVEN_MOUNT = 1.0, math.radians(0.5)
 
 _SIGNED_ORDERS = tuple(
     np.diag(signs)[:, list(order)] for order in ((0, 1), (1, 0)) for signs in product((1.0, -1.0), repeat=2)
@@ -161,7 +163,7 @@ class _ShownTilts:
 
     @classmethod
     def of(cls, problem: Problem, fit: Fit, options: AlignmentOptions) -> "_ShownTilts":
-        """Take the tilts from a planar fit that knows nothing of them; up to what all share where no tilt is given."""
+        """Take the tilts from a planar fit that knows nothing of them; up to what all share of a mount."""
         adjuster, adjusted, model = problem.adjuster_of(fit), fit.result, fit.model
         normal = adjuster.normal_equations(adjusted)
         tilts = model.metric_poses(adjusted.parameters.poses, adjusted.parameters.shared)[:, [PSI, THETA]]
@@ -177,8 +179,9 @@ class _ShownTilts:
         by_shared[len(model.shared_names) - 1] = tilts[images].ravel()
         moved_poses, moved_shared = normal.responses(-by_pose, -by_shared)
         covariance = np.einsum("ndb,ndc->bc", by_pose, moved_poses, optimize=True) + by_shared.T @ moved_shared
-        if options.tilt is None:
-            covariance = covariance + _FREE_MOUNT**2 * np.tile(np.eye(2), (len(images), len(images)))
+        if options.tilt is None or options.attitudes is None:
+            mount = _FREE_MOUNT if options.tilt is None else _GIVEN_MOUNT
+            covariance = covariance + mount**2 * np.tile(np.eye(2), (len(images), len(images)))
         variances, axes = np.linalg.eigh((covariance + covariance.T) / 2.0)
         return cls(images, tilts[images], np.maximum(variances, 0.0), axes)
 
