@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 # Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them.
 _SELECT_MODEL_BELOW = 50
 
+PREVIEW = {"seam": "voronoi", "max_features": 1500, "work_megapixels": 0.5, "max_size": 1200}
+"""A quick draft: options of features and of the composite, by name."""
+
 
 @documented
 @dataclass(frozen=True)
