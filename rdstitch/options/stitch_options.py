@@ -160,7 +160,8 @@ class StitchOptions(RansacOptions, RunOptions):
     @property
     def known_camera(self) -> "Camera | None":
         """The camera that was given, which the recipe has read where it was a file."""
-        assert not isinstance(self.camera, str | Path)
+        if isinstance(self.camera, str | Path):
+            raise ArgumentError(f"{self.camera}: has not been read yet; give rdstitch.load_camera of it")
         return self.camera
 
     @property
