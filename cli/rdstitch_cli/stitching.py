@@ -14,7 +14,7 @@ from rdstitch.options.composite_options import CompositeOptions
 from rdstitch.options.feature_options import FeatureOptions
 from rdstitch.options.files_beside import FilesBeside
 from rdstitch.options.option import Option
-from rdstitch.options.stitch_options import StitchOptions
+from rdstitch.options.stitch_options import PREVIEW, StitchOptions
 from rdstitch.results.messages import bytes_in_words, seconds_in_words
 from rdstitch_cli.flags import flags_of, is_given, values_of
 from rdstitch_cli.terminal import Reporter
@@ -36,24 +36,22 @@ STITCHING = [*flags_of(StitchOptions, without="odometry"), *flags_of(FeatureOpti
 """The options of every command that composes the images that it registers."""
 
 
-def resolve(inputs: tuple[Path, ...]) -> list[Path]:
-    """The inputs, with - replaced by the names on standard input, one a line or separated by NUL."""
+def resolve(inputs: tuple[Path | str, ...]) -> list[Path | str]:
+    """The inputs, with - replaced by the names on standard input, one a line or separated by NUL; URLs stay text."""
     from rdstitch.inputs.arguments import names_in
 
-    named: list[Path] = []
+    named: list[Path | str] = []
     for item in inputs:
-        listed = names_in(os.fsdecode(sys.stdin.buffer.read())) if str(item) == "-" else [item]
-        named.extend(map(Path, listed))
+        named += names_in(os.fsdecode(sys.stdin.buffer.read())) if str(item) == "-" else [item]
     return named
 
 
 def stitch_options(given: Mapping[str, Any], *, preview: bool = False, **more: Any) -> StitchOptions:
     """The library's options from a command's flags."""
     if preview:
-        quick = {"seam": "voronoi", "max_features": 1500, "work_megapixels": 0.5}
-        if not (is_given("like") or is_given("extent")):
-            quick["max_size"] = 1200  # they say the size too
-        given = {**given, **{name: value for name, value in quick.items() if not is_given(name)}}
+        sized = is_given("like") or is_given("extent")
+        left = [name for name in PREVIEW if not (is_given(name) or (sized and name == "max_size"))]
+        given = {**given, **{name: PREVIEW[name] for name in left}}
     more |= {
         "features": FeatureOptions(**values_of(FeatureOptions, given)),
         "composite": CompositeOptions(**values_of(CompositeOptions, given)),

@@ -1,6 +1,5 @@
 """How pairs are estimated."""
 
-import math
 from dataclasses import dataclass
 
 from rdstitch.choices import SolverName
@@ -35,15 +34,16 @@ class RansacOptions(Options):
 class EstimationOptions(RansacOptions):
     """The same with what is known of the lens, and of how many matches a pair needs."""
 
-    distortion: float | None = None  # known λ in the half-diagonal frame; it is then not estimated
-    # inliers below which the models of planar motion compete with the free homography, which needs more of them; None:
-    # always
-    select_below: int | None = None
+    distortion: float | None = option(
+        None, "Known λ in the half-diagonal frame; it is then not estimated.", within=Range(below=1.0)
+    )
+    select_below: int | None = option(
+        None,
+        "Inliers below which the models of planar motion compete with the free homography, which needs more of them; "
+        "None: always.",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.distortion is None:
-            return
-        self.refuse_solver()
-        if not -math.inf < self.distortion < 1.0:
-            raise ArgumentError(f"distortion must be a number below 1, not {self.distortion}")
+        if self.distortion is not None:
+            self.refuse_solver()

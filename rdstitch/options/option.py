@@ -129,7 +129,8 @@ class Declared:
         """
         if (value is None and self.optional) or (isinstance(value, str) and value in self.words):
             return value
-        for kind in self.types if value is not None else ():
+        nameless = isinstance(value, str) and not value and self.option.file is not None  # not the current folder
+        for kind in self.types if value is not None and not nameless else ():
             with suppress(TypeError, ValueError):
                 return _taken(value, kind, self.option)
         raise ArgumentError(f"{self.name} must be {self.expected}, not {value!r}")
@@ -177,7 +178,7 @@ class Options:
         """Refuse a value that its field may not have, and what contradicts another one."""
         for name, option in declared(self).items():
             value = getattr(self, name)
-            if isinstance(value, str) and option.types == (Path,):
+            if isinstance(value, str) and value and option.types == (Path,):
                 value = Path(value)
             object.__setattr__(self, name, option.taken(value))
         for each in fields(self):
@@ -264,7 +265,8 @@ def _taken(value: Any, kind: Any, option: Option) -> Any:
         number = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
         fits = number and value in option.within
     elif isinstance(kind, ForwardRef):  # names of classes that are not imported here; what is like an array, NumPy says
-        known, names = kind.__forward_arg__.split(" | "), {base.__name__ for base in type(value).__mro__}
+        own = (base for base in type(value).__mro__ if base.__module__.partition(".")[0] in ("rdstitch", "builtins"))
+        known, names = kind.__forward_arg__.split(" | "), {base.__name__ for base in own}
         fits = "ArrayLike" in known or isinstance(value, PathLike) or not names.isdisjoint(known)
     else:
         fits = isinstance(value, {str: str, Path: PathLike, bool: bool}.get(kind, object))

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 # Inliers from which on a free homography is as sure as a motion of the plane; the alignment decides between them.
 _SELECT_MODEL_BELOW = 50
 
+PREVIEW = {"seam": "voronoi", "max_features": 1500, "work_megapixels": 0.5, "max_size": 1200}
+"""A quick draft: options of features and of the composite, by name."""
+
 
 @documented
 @dataclass(frozen=True)
@@ -157,7 +160,8 @@ class StitchOptions(RansacOptions, RunOptions):
     @property
     def known_camera(self) -> "Camera | None":
         """The camera that was given, which the recipe has read where it was a file."""
-        assert not isinstance(self.camera, str | Path)
+        if isinstance(self.camera, str | Path):
+            raise ArgumentError(f"{self.camera}: has not been read yet; give rdstitch.load_camera of it")
         return self.camera
 
     @property

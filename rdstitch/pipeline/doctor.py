@@ -21,7 +21,7 @@ from rdstitch.options.option import check_parameter
 from rdstitch.options.shared_options import Every
 from rdstitch.options.stitch_options import StitchOptions
 from rdstitch.pipeline.recipes import mosaic
-from rdstitch.results.messages import Message, merge_by_reason
+from rdstitch.results.messages import Message, merge_by_reason, shortened
 from rdstitch.results.registration import Registration
 from rdstitch.system.native_threads import one_native_thread
 from rdstitch.system.progress import Progress, silent
@@ -32,6 +32,7 @@ from rdstitch.verification.verdict import RefusedError
 _MEGAPIXELS, _FEATURES = 0.2, 500  # of the small versions
 _BLURRED = 0.6  # of the median sharpness
 _DARK, _BURNT = 0.06, 0.05  # mean brightness; share of burnt-out pixels
+_OVERLAP = 0.3  # of neighbours, below which more images are advised
 _GRID = 24  # points a side by which an overlap is measured
 
 
@@ -65,6 +66,31 @@ class Examination:
     """Size of the mosaic, with memory and time of compositing it; None where there would be none."""
     problems: tuple[Message, ...]
     """What a run would say, gravest first."""
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What to change, most important first; empty where nothing is amiss."""
+        known, unread = [camera for camera, _ in self.cameras if camera], self.unreadable
+        advice = (
+            (self.images < 2, "stitching needs two images or more; name another one"),
+            (len(known) > 1, f"the images come from {len(known)} cameras: stitch those of each on their own"),
+            (self.zoomed, "the lens was zoomed between the images: stitch those of one zoom on their own"),
+            (unread, f"{len(unread)} file{'s' * (len(unread) != 1)} cannot be read: {''.join(unread[:1])}"),
+            *((True, str(problem)) for problem in self.problems),
+            (
+                self.overlap is not None and self.overlap < _OVERLAP,
+                f"images overlap by about {self.overlap or 0.0:.0%} only: take more images, a third is the least",
+            ),
+            (
+                self.blurred,
+                f"leave blurred images out if their neighbours overlap without them: {shortened(self.blurred)}",
+            ),
+            (
+                self.dark or self.burnt,
+                "dark or burnt-out images have few features: fix the exposure if you can take them again",
+            ),
+        )
+        return tuple(text for applies, text in advice if applies)
 
 
 @one_native_thread()

@@ -72,6 +72,7 @@ def test_zooms_and_cameras_are_told_apart(frames: list[Path], tmp_path: Path, rd
             image.save(tmp_path / f"{number}.jpg", exif=exif, quality=95)
     found = examine(tmp_path)
     assert found.cameras == (("A", 2), ("B", 1))
+    assert found.advice[0].startswith("the images come from 2 cameras")
     assert (len(found.focal_px), found.zoomed) == (3, True)
     text = rdstitch("doctor", tmp_path).out
     assert "by EXIF in 3 of 3" in text

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from rdstitch_cli.stitching import resolve
 
 from rdstitch.errors import ImpossibleCameraError
 from rdstitch.geometry.camera import Camera
@@ -365,6 +366,10 @@ def test_what_fails_in_the_middle(
 
     monkeypatch.setattr(module, function, raised if callable(raised) else fail)
     _check(rdstitch, here, PANO.split(), status, told)
+
+
+def test_an_address_among_inputs_keeps_its_slashes() -> None:
+    assert resolve(("http://a.b/c.jpg", Path("d.jpg"))) == ["http://a.b/c.jpg", Path("d.jpg")]
 
 
 @pytest.mark.parametrize("command", sampled(["pano", "calibrate", "trajectory", "undistort"]))

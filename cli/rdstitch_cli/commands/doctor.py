@@ -16,8 +16,6 @@ from rdstitch_cli.terminal import Reporter
 if TYPE_CHECKING:
     from rdstitch.pipeline.doctor import Examination
 
-_MIN_OVERLAP = 0.3  # of neighbours, below which more images are advised
-
 
 @command(
     """
@@ -50,7 +48,7 @@ def doctor(
 def _record(found: "Examination") -> dict[str, Any]:
     """What was found, for JSON."""
     record = {name: value for name, value in asdict(found).items() if name not in ("focal_px", "zoomed", "problems")}
-    words = {"sizes": _sizes(found), "cameras": _cameras(found), "focal": _focal(found), "advice": _advice(found)}
+    words = {"sizes": _sizes(found), "cameras": _cameras(found), "focal": _focal(found), "advice": found.advice}
     order = "images unreadable sizes cameras focal blurred dark burnt alone overlap plan advice"
     return {name: (record | words)[name] for name in order.split()}
 
@@ -79,7 +77,7 @@ def _text(found: "Examination") -> str:
         ),
         ("overlap", f"{overlap}; {few(found.alone, 'without a place', 'every image has a place')}"),
         ("mosaic", effort),
-        *(("advice", item) for item in _advice(found) or ["none: go ahead"]),
+        *(("advice", item) for item in found.advice or ("none: go ahead",)),
     ]
     return "".join(f"{name + ':':<12}{text}\n" for name, text in lines)
 
@@ -97,28 +95,3 @@ def _focal(found: "Examination") -> str:
         return "not known from EXIF; it is guessed, which matters for trajectory only"
     text = f"{min(found.focal_px):.0f}" + (f" to {max(found.focal_px):.0f}" if found.zoomed else "")
     return f"{text} pixels by EXIF in {len(found.focal_px)} of {found.images} images"
-
-
-def _advice(found: "Examination") -> list[str]:
-    """What to change, most important first; empty where nothing is amiss."""
-    known, unreadable = [camera for camera, _ in found.cameras if camera], found.unreadable
-    advice = (
-        (found.images < 2, "stitching needs two images or more; name another one"),
-        (len(known) > 1, f"the images come from {len(known)} cameras: stitch those of each on their own"),
-        (found.zoomed, "the lens was zoomed between the images: stitch those of one zoom on their own"),
-        (unreadable, f"{len(unreadable)} file{'s' * (len(unreadable) != 1)} cannot be read: {''.join(unreadable[:1])}"),
-        *((True, str(problem)) for problem in found.problems),
-        (
-            found.overlap is not None and found.overlap < _MIN_OVERLAP,
-            f"images overlap by about {found.overlap or 0.0:.0%} only: take more images, a third is the least",
-        ),
-        (
-            found.blurred,
-            f"leave blurred images out if their neighbours overlap without them: {shortened(found.blurred)}",
-        ),
-        (
-            found.dark or found.burnt,
-            "dark or burnt-out images have few features: fix the exposure if you can take them again",
-        ),
-    )
-    return [text for applies, text in advice if applies]

@@ -11,6 +11,7 @@ import pytest
 import rdstitch
 from rdstitch import Camera, CompositeOptions, FilesBeside, StitchOptions, TileOptions
 from rdstitch.errors import ArgumentError
+from rdstitch.options.estimation_options import EstimationOptions
 from rdstitch.options.option import Option, Options, Range, Unit, declared, documented
 
 
@@ -125,6 +126,24 @@ def test_a_tilt_is_in_radians(tilt: tuple[float, float]) -> None:
 def test_an_extent_has_four_sides_in_their_order(extent: Any) -> None:
     with pytest.raises(ArgumentError, match=r"extent must be (4 numbers|west, south, east and north)"):
         CompositeOptions(extent=extent)
+
+
+@pytest.mark.parametrize("name", ["cache", "save_camera", "camera", "positions", "gcp", "mask", "attitude", "odometry"])
+def test_an_empty_name_is_not_the_current_folder(name: str) -> None:
+    given: Any = {name: ""}
+    with pytest.raises(ArgumentError, match=f"{name} must be .*, not ''"):
+        StitchOptions(**given)
+
+
+def test_a_camera_is_that_of_this_package_and_read_before_it_is_asked_for_its_lens() -> None:
+    other: Any = type("Camera", (), {})()
+    with pytest.raises(ArgumentError, match="camera must be Camera or a file"):
+        StitchOptions(camera=other)
+    with pytest.raises(ArgumentError, match=r"x\.json: has not been read yet"):
+        _ = StitchOptions(camera="x.json").known_distortion
+    wrong: Any = {"select_below": "50"}
+    with pytest.raises(ArgumentError, match="select_below must be a whole number"):
+        EstimationOptions(**wrong)
 
 
 def test_arrays_become_tuples_of_numbers() -> None:
