@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rdstitch.alignment.adjustment_problem import Fit, Problem
 from rdstitch.alignment.least_squares.bundle_adjustment import BundleAdjuster
@@ -20,15 +19,12 @@ from rdstitch.alignment.least_squares.plane_marks import ControlPoints, PlaneMar
 from rdstitch.alignment.least_squares.priors import CameraPriors
 from rdstitch.alignment.motion_models import X, Y
 from rdstitch.alignment.sentences import map_contradicted
-from rdstitch.arrays import FloatArray, IntArray, evenly_spaced
-from rdstitch.geometry.places import MILLIMETRE
+from rdstitch.arrays import ComplexArray, FloatArray, IntArray, evenly_spaced
+from rdstitch.geometry.places import MILLIMETRE, POSITION_STD
 from rdstitch.numerics.robust_loss import RAYLEIGH_MEDIAN
 from rdstitch.results.messages import Message
 from rdstitch.robust.posterior import MODEL_ERROR
 from rdstitch.robust.similarity_fit import OUTLYING, SimilarityFit, fit_similarity
-
-POSITION_STD = 3.0
-"""Metres: of one coordinate of a position by a receiver without corrections, within one flight."""
 
 _MIN_POSITIONS = 4  # positions that say anything of the shape
 _MIN_CONTROL = 3  # control points that do
@@ -40,7 +36,6 @@ _MAX_GROWTH = 1.1  # times by which the errors of the images may grow
 _SURE = 1.0 - 1e-6  # leverage beyond which rounding counts
 _MANY = 50  # positions whose leverage is computed; that of others is taken to be the median
 
-ComplexArray = NDArray[np.complex128]
 _COMPLEX = np.array([1.0, 1.0j])
 
 

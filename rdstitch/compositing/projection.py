@@ -69,9 +69,18 @@ class _Longitude(Projection):
     """The longitude, and a function of the latitude's tangent."""
 
     periodic = True
-    _height: "ClassVar[staticmethod[..., FloatArray]]"  # of that
-    _slope: "ClassVar[staticmethod[..., FloatArray]]"  # its inverse
-    _highest: "ClassVar[staticmethod[..., float]]"  # y up to which it stretches no more than so many times
+
+    @abstractmethod
+    def _height(self, slope: FloatArray) -> FloatArray:
+        """The y of a latitude, by its tangent."""
+
+    @abstractmethod
+    def _slope(self, height: FloatArray) -> FloatArray:
+        """The tangent of the latitude of a y; NaN where there is none."""
+
+    @abstractmethod
+    def _highest(self, stretch: float) -> float:
+        """The y up to which areas are stretched no more than so many times."""
 
     def project(self, directions: FloatArray) -> FloatArray:
         """Places of all directions; infinite at poles, where that is so."""
@@ -92,16 +101,30 @@ class Cylinder(_Longitude):
     """``(longitude, tan latitude)``: verticals stay straight; wide and low."""
 
     name = "cylinder"
-    _height = _slope = staticmethod(lambda slope: slope)
-    _highest = staticmethod(lambda stretch: math.sqrt(stretch - 1.0))  # heights grow with 1 / cos²
+
+    def _height(self, slope: FloatArray) -> FloatArray:
+        return slope
+
+    def _slope(self, height: FloatArray) -> FloatArray:
+        return height
+
+    def _highest(self, stretch: float) -> float:
+        return math.sqrt(stretch - 1.0)  # heights grow with 1 / cos²
 
 
 class Mercator(_Longitude):
     """``(longitude, asinh tan latitude)``: keeps shapes; between cylinder and sphere."""
 
     name = "mercator"
-    _height, _slope = staticmethod(np.arcsinh), staticmethod(np.sinh)
-    _highest = staticmethod(math.acosh)  # lengths grow with 1 / cos
+
+    def _height(self, slope: FloatArray) -> FloatArray:
+        return np.arcsinh(slope)
+
+    def _slope(self, height: FloatArray) -> FloatArray:
+        return np.sinh(height)
+
+    def _highest(self, stretch: float) -> float:
+        return math.acosh(stretch)  # lengths grow with 1 / cos
 
 
 class Sphere(_Longitude):
@@ -111,9 +134,15 @@ class Sphere(_Longitude):
     """
 
     name = "sphere"
-    _height = staticmethod(np.arctan)
-    _slope = staticmethod(lambda height: np.where(np.abs(height) <= np.pi / 2, np.tan(height), np.nan))
-    _highest = staticmethod(lambda stretch: math.pi / 2.0)
+
+    def _height(self, slope: FloatArray) -> FloatArray:
+        return np.arctan(slope)
+
+    def _slope(self, height: FloatArray) -> FloatArray:
+        return np.where(np.abs(height) <= np.pi / 2, np.tan(height), np.nan)
+
+    def _highest(self, stretch: float) -> float:
+        return math.pi / 2.0
 
 
 class Panini(Projection):

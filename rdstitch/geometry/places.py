@@ -4,6 +4,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+POSITION_STD = 3.0
+"""Metres: of one coordinate of a position by a receiver without corrections, within one flight."""
+
 MILLIMETRE = 1e-3  # metres to which coordinates are written: no place is more exact
 
 

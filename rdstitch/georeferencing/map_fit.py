@@ -18,11 +18,11 @@ from typing import NamedTuple
 import numpy as np
 
 from rdstitch.arrays import BoolArray, ComplexArray, FloatArray
+from rdstitch.geometry.places import POSITION_STD
 from rdstitch.georeferencing.camera_views import Views
 from rdstitch.robust.similarity_fit import OUTLYING, fit_similarity
 
 SLOPE_STD = math.radians(1.0)  # of the ground: level to gently sloping in the classes of the FAO (up to 5 %)
-POSITION_STD = 3.0  # metres: of one coordinate of a position by a receiver without corrections, within one flight
 _ROUNDS = 12
 _SMALLEST = 0.1  # pixels of the images: an error that every position has
 _SHOWN = 4.0  # standard deviations from which on the ground is not level

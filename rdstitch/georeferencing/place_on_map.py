@@ -12,7 +12,7 @@ from rdstitch.geometry.places import GpsPosition, GroundControl
 from rdstitch.geometry.radial_homography import to_plane
 from rdstitch.georeferencing.camera_views import Views, as_complex, views_of
 from rdstitch.georeferencing.georeference import Georeference, PositionKind, Residual, metres
-from rdstitch.georeferencing.map_fit import Measured, fit_map
+from rdstitch.georeferencing.map_fit import MapFit, Measured, fit_map
 from rdstitch.inputs.source import Source
 
 MIN_POSITIONS = 3
@@ -166,13 +166,6 @@ def _placed(known: _KnownPlaces, errors: AlignmentErrors, epsg: int | None, forc
     hills = errors.relief * views.pixel
     if errors.lever_std is not None and np.isfinite(views.height).any():
         hills = errors.lever_std * float(np.nanmedian(views.height))
-    assumption = ""
-    if source is PositionKind.GPS and views.known == "centres":
-        shift = metres(float(np.median(views.height)) * abs(fit.scale) * math.radians(1.0))
-        assumption = (
-            "the images have no poses: GPS positions are taken for those of the image centres, and each degree that "
-            f"the cameras were tilted together shifts the map by {shift}"
-        )
     place = Georeference(
         crs,
         fit.scale,
@@ -183,6 +176,17 @@ def _placed(known: _KnownPlaces, errors: AlignmentErrors, epsg: int | None, forc
         std=None if fit.std is None else math.hypot(fit.std, hills * abs(fit.scale)),
         scale_std=fit.scale_std,
         map_scale=map_scale,
-        assumption=assumption,
+        assumption=_assumption(views, fit) if source is PositionKind.GPS else "",
     )
     return MapPlacement(place, cautions=(contradiction,) if contradiction else ())
+
+
+def _assumption(views: Views, fit: MapFit) -> str:
+    """What was assumed of where cameras are, and how far that may shift the map."""
+    if views.known != "centres":
+        return ""
+    shift = metres(float(np.median(views.height)) * abs(fit.scale) * math.radians(1.0))
+    return (
+        "the images have no poses: GPS positions are taken for those of the image centres, and each degree that "
+        f"the cameras were tilted together shifts the map by {shift}"
+    )
