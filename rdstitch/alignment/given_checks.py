@@ -2,8 +2,8 @@
 
 The images are aligned without them, and show the tilt of each up to a covariance. Attitudes that need more scatter
 than they are said to have are compared with the same angles of other signs and in the other order, and with none at
-all, each with the scatter that makes it most likely. A focal length that gives way to the images is compared with the
-one that they show by themselves.
+all, each with the scatter that makes it most likely. A given tilt is compared with the one that all show, too. A focal
+length that gives way to the images is compared with the one that they show by themselves.
 """
 
 import math
@@ -30,6 +30,7 @@ from rdstitch.robust.priors import WRONG_GIVEN_FOCAL
 _MAX_IMAGES = 60  # that are compared: evenly chosen ones of more say as well which signs are right
 _LOG_ODDS = math.log(1000.0)  # by how much the images must contradict what the user says
 _SCATTERS = np.append(0.0, np.radians(np.geomspace(0.01, 45.0, 60)))  # standard deviations that are tried
+_CENTER_STD = 0.03  # half diagonals, of the distortion centre: as in LENS_PRIORS
 _EXACT = math.radians(0.01)  # nothing is mounted more exactly
 _STRAINED = 2.0  # standard deviations of a given focal length by which it must have given way to be looked at again
 
@@ -76,21 +77,26 @@ def _contradiction(
     shown: "_ShownTilts", given: FloatArray, options: AlignmentOptions
 ) -> tuple[AlignmentOptions, Message] | None:
     """What replaces the options where the images contradict the given tilts (N, 2), radians, or their accuracy."""
-    if options.attitudes is None:  # one tilt for all, against the one that they show
-        common = np.median(shown.tilts, axis=0)
-        as_shown, as_given = (shown.best_scatter(np.broadcast_to(tilt, given.shape))[0] for tilt in (common, given[0]))
-        contradicted = as_shown >= as_given + _LOG_ODDS
-        return (_without_tilts(options), sentences.tilt_contradicted(given[0], common)) if contradicted else None
-    stated = options.attitudes_std
-    # The largest log likelihood and its scatter of attitudes as given, with other signs or order, and of none.
+    stated = options.attitudes_std if options.attitudes is not None else 0.0
+    # The largest log likelihood and its scatter of tilts as given, with other signs or order, and of none.
     changed = [shown.best_scatter(given @ change.T) for change in _SIGNED_ORDERS]
     (as_given, scatter), likeliest = changed[0], max(range(len(changed)), key=lambda k: changed[k][0])
     (as_changed, scatter_changed), (without_any, _) = changed[likeliest], shown.best_scatter(np.zeros_like(given))
+    common = np.median(shown.tilts, axis=0)
+    if options.attitudes is None:  # against the one that all show, unless the distortion centre explains the difference
+        as_shown, _ = shown.best_scatter(np.broadcast_to(common, given.shape))
+        by_center = as_shown - 0.5 * float((((common - given[0]) / shown.center_std) ** 2).sum())
+        if as_shown >= max(as_given, by_center) + _LOG_ODDS:
+            return _without_tilts(options), sentences.tilt_contradicted(given[0], common)
     if as_given - shown.log_likelihood(given, stated) < _LOG_ODDS or scatter <= stated:
         return None
     if max(as_changed, without_any) >= as_given + _LOG_ODDS:
+        if options.attitudes is None:
+            return _without_tilts(options), sentences.tilt_contradicted(given[0], common)
         change = _SIGNED_ORDERS[likeliest] if as_changed > without_any + _LOG_ODDS else None
         return _without_tilts(options), sentences.attitudes_contradicted(scatter, change, max(scatter_changed, _EXACT))
+    if options.attitudes is None:
+        return None
     return replace(options, attitudes_std=scatter), sentences.attitudes_scatter(scatter, stated)
 
 
@@ -154,6 +160,7 @@ class _ShownTilts:
 
     images: IntArray  # (K,): the images compared
     tilts: FloatArray  # (K, 2): (ψ, θ), radians
+    center_std: float  # of a tilt, radians, by what is not known of the distortion centre
     variances: FloatArray  # variances, axes: (2 K,) and (2 K, 2 K): eigenvalues and eigenvectors of their covariance
     axes: FloatArray
 
@@ -178,7 +185,7 @@ class _ShownTilts:
         if options.tilt is None:
             covariance = covariance + _FREE_MOUNT**2 * np.tile(np.eye(2), (len(images), len(images)))
         variances, axes = np.linalg.eigh((covariance + covariance.T) / 2.0)
-        return cls(images, tilts[images], np.maximum(variances, 0.0), axes)
+        return cls(images, tilts[images], _CENTER_STD / focal, np.maximum(variances, 0.0), axes)
 
     def log_likelihood(self, expected: FloatArray, scatter: float) -> float:
         """Log-likelihood of tilts (N, 2) that scatter by so much, radians, about those of the images."""
