@@ -35,11 +35,12 @@ def poses_table(result: StitchResult, frame: PosesFrame = "enu", height: float =
     top of an image is north, and covariances relative to the place of the reference image.
     """
     registration = result.registration
-    path = Trajectory.from_alignment(registration.alignment, height)
     if frame == "map":
         poses, to_map, place = _poses_and_map(result, "leave out --frame map")
         stds = {"length_std": registration.alignment.length_std, "scale_std": place.scale_std}
         path = Trajectory.on_map(poses, to_map, place.map_scale, **stds)
+    else:
+        path = Trajectory.from_alignment(registration.alignment, height)
     sources = registration.sources
     numbers = frame_numbers([source.frame for source in sources])
     path = path.labelled([source.name for source in sources], numbers, timestamps_of(sources))

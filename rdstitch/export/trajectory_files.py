@@ -46,7 +46,8 @@ def path_as_svg(path: Trajectory, unit_name: str = "heights") -> str:
     ``unit_name`` is that of the positions, for the scale bar.
     """
     low, extent = path.position.min(axis=0), np.ptp(path.position, axis=0)
-    unit = _SIDE / max(float(extent.max()), 1e-12)
+    side = float(extent.max())
+    unit = _SIDE / max(side, 1e-12)
     points = (path.position - low) * unit + _MARGIN
     width, height = extent * unit + 2 * _MARGIN
     line = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
@@ -57,7 +58,11 @@ def path_as_svg(path: Trajectory, unit_name: str = "heights") -> str:
         f'<line x1="{x:.1f}" y1="{y:.1f}" x2="{x + dx:.1f}" y2="{y + dy:.1f}" marker-end="url(#tip)"/>'
         for (x, y), (dx, dy) in zip(points[shown], heading[shown], strict=True)
     )
-    scale = 10.0 ** np.floor(np.log10(max(float(extent.max()), 1e-12)))
+    bar, scale = "", 10.0 ** np.floor(np.log10(max(side, 1e-12)))
+    if side > 0.0:  # a path that stays where it is has no scale
+        bar = f"""<path d="M20,{height - 20:.1f} h{scale * unit:.1f}" stroke="black" stroke-width="2"/>
+<text x="20" y="{height - 26:.1f}" font-size="14">{scale:g} {unit_name}</text>
+"""
     return f"""<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" font-family="sans-serif">
 <defs><marker id="tip" markerWidth="6" markerHeight="6" refX="3" refY="3" orient="auto">
 <path d="M0,1 L5,3 L0,5 z" fill="#c33"/></marker></defs>
@@ -65,9 +70,7 @@ def path_as_svg(path: Trajectory, unit_name: str = "heights") -> str:
 <polyline points="{line}" fill="none" stroke="#236" stroke-width="2"/>
 <g stroke="#c33" stroke-width="1.2">{arrows}</g>
 <circle cx="{points[0, 0]:.1f}" cy="{points[0, 1]:.1f}" r="5" fill="#2a2"/>
-<path d="M20,{height - 20:.1f} h{scale * unit:.1f}" stroke="black" stroke-width="2"/>
-<text x="20" y="{height - 26:.1f}" font-size="14">{scale:g} {unit_name}</text>
-</svg>
+{bar}</svg>
 """
 
 

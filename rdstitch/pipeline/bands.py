@@ -53,7 +53,8 @@ def mosaic_bands(
 
     ``bands`` are patterns of the names of images by the names of bands, the registered one first; ``beside`` is for
     it alone. ``field.tif`` has all bands, with their names; ``field-NIR.tif`` and so on one each. Formats that hold
-    no number of bands have only the latter. Given are the first band, and the others, each by its own lens.
+    no number of bands have only the latter. Returns the result of the first band, and those of the others, each
+    composed with its own lens.
     """
     file = Path(output)
     files = [file_of_part(file, name) for name in bands]
@@ -94,14 +95,15 @@ def _check_alike(bands: Mapping[str, list[Frame]], *, in_one_file: bool, is_ome:
         read = [source.metadata for source in sources]
         if is_ome and any(one.planes or one.channels not in (1, 3) for one in read):  # each is read from one page
             raise ArgumentError(f"bands: images of {name} are neither grey nor RGB, as an OME-TIFF needs; name a .tif")
-        bits = {next(depth for depth in (8, 16, 64) if one.bit_depth <= depth) for one in read}
-        kinds[name] = {"{} x {} pixels".format(*one.size) for one in read}, {f"{depth} bits" for depth in bits}
+        written = [next(depth for depth in (8, 16, 64) if one.bit_depth <= depth) for one in read]
+        depths = {depth: f"{one.bit_depth} bits" for depth, one in zip(written, read, strict=True)}
+        kinds[name] = {"{} x {} pixels".format(*one.size) for one in read}, depths
     first = next(iter(bands))
     for name, (sizes, depths) in kinds.items():
         if sizes != kinds[first][0]:
             reason, differing = "their lenses are compared at one size", (kinds[first][0], sizes)
-        elif in_one_file and depths != kinds[first][1]:
-            reason, differing = "one TIFF cannot hold both", (kinds[first][1], depths)
+        elif in_one_file and depths.keys() != kinds[first][1].keys():
+            reason, differing = "one TIFF cannot hold both", ({*kinds[first][1].values()}, {*depths.values()})
         else:
             continue
         one, other = (", ".join(sorted(values)) for values in differing)

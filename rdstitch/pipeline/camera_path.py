@@ -49,7 +49,7 @@ def _along_odometry(
     if along is None:
         return path, [
             *messages,
-            Message(f"{odometry.name}: shows no motion of the images that have a pose; it is not used"),
+            Message(f"{odometry.name}: shows too few motions, or none, of the images that have a pose; it is not used"),
         ]
     whole, fit = along
     if not keep_unit:

@@ -270,6 +270,8 @@ def _as_numbers(name: str, value: ArrayLike, *shape: int) -> list[float]:
 
 
 def _tilt(psi: float, theta: float) -> MeasuredTilt:
+    if math.isnan(psi) or math.isnan(theta):
+        raise InputError("its attitude is not known (NaN)")
     if not all(abs(angle) < math.pi / 2.0 for angle in (psi, theta)):
         raise InputError(
             f"psi and theta must lie between -π/2 and π/2 radians, those of its attitude are {psi:g}, {theta:g}"

@@ -49,7 +49,11 @@ class OdometryFit:
 
     @classmethod
     def of(cls, motions: Sequence[Motion]) -> "OdometryFit | None":
-        """Fit motions between frames; None where they are too few, or none goes anywhere."""
+        """Fit motions between frames; None where they are too few, or none goes anywhere.
+
+        With A = [camera, 1 - exp(i turn)], b = body and diagonal weights W, those of the variances times Huber's, scale
+        and lever s solve the normal equations (Aᴴ W A + P) s = Aᴴ W b, where P is the prior of the lever.
+        """
         if len(motions) < _MIN_STEPS:
             return None
         body, camera, turn, variance = (np.array(column) for column in zip(*motions, strict=True))
@@ -59,14 +63,14 @@ class OdometryFit:
         # What images are off by does not become less where a body hardly moves.
         least = max(variance.mean(), (_EXACT * np.abs(body).max()) ** 2)
         weight, prior = 1.0 / np.maximum(variance, least), np.diag([0.0, 1.0 / _LEVER**2])
-        rest = np.ones(len(body))
+        robust_weight = np.ones(len(body))
         for _ in range(_ROUNDS):
-            by = design.conj().T * (weight * rest)
-            normal = by @ design + prior
-            solution = np.linalg.solve(normal, by @ body)
+            weighted_design = design.conj().T * (weight * robust_weight)
+            normal = weighted_design @ design + prior
+            solution = np.linalg.solve(normal, weighted_design @ body)
             errors = np.abs(body - design @ solution) * np.sqrt(weight)
             noise = max(float(np.median(errors)) / RAYLEIGH_MEDIAN, 1e-9)
-            rest = np.minimum(1.0, _HUBER * noise / np.maximum(errors, 1e-300))
+            robust_weight = np.minimum(1.0, _HUBER * noise / np.maximum(errors, 1e-300))
         scale, lever = complex(solution[0]), complex(solution[1])
         if not abs(scale) > 0.0:
             return None
@@ -117,7 +121,7 @@ def along_odometry(
 ) -> tuple[Trajectory, OdometryFit] | None:
     """A path in the unit of the odometry, unless its own is kept, with poses of all frames that the odometry leads to.
 
-    ``bodies``: by the number of the frame. None where the odometry shows no motion of the frames.
+    ``bodies``: by the number of the frame. None where it shows too few motions of the frames, or none.
     """
     places = (path.position @ np.array([1.0, -1.0j])).tolist()
     known = [bodies.get(frame) for frame in path.frame.tolist()]

@@ -172,7 +172,8 @@ class Trajectory:
 
     def __repr__(self) -> str:
         """One line: the number of frames and the length of the path."""
-        return f"<Trajectory {len(self)} frames, {self.length:.3g} long, from height {self.height[0]:.3g}>"
+        start = f", {self.length:.3g} long, from height {self.height[0]:.3g}" if len(self) else ""
+        return f"<Trajectory {len(self)} frames{start}>"
 
     def __len__(self) -> int:
         """Number of frames."""

@@ -68,6 +68,9 @@ def test_dry_run_reports_and_writes_nothing(rdstitch: Run, frames: list[Path], t
     rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", *CACHED)
     height, width = read_image(tmp_path / "a.png").pixels.shape[:2]
     assert told["canvas"].startswith(f"{width} x {height} pixels")
+    before = (tmp_path / "a.png").read_bytes()
+    rdstitch("mosaic", *frames, "-o", tmp_path / "a.png", "--dry-run", *CACHED)
+    assert (tmp_path / "a.png").read_bytes() == before
 
 
 def test_deep_zoom_is_the_same_image(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from rdstitch.io.flat_field import read_flat_field
 from rdstitch.results.messages import Message
 
 NO_FLAT_FIELD = Message(
-    "the tiles show no illumination that all have in common, and samples stay as they are",
+    "the images show no illumination that all have in common, and samples stay as they are",
     severity="note",
     code="flat-field",
 )
@@ -38,7 +38,7 @@ def with_flat_field(sources: Sequence[Source], wanted: str | Path) -> tuple[list
         return [replace(source, flat_field=field) for source in sources], []
     shown = estimate_illumination(lambda index: sources[index].read().pixels, len(sources))
     if shown is FlatFieldUnknown.FEW_TILES:
-        text = f"{len(sources)} tiles are too few to show their flat field, and samples stay as they are"
+        text = f"{len(sources)} images are too few to show their flat field, and samples stay as they are"
         return list(sources), [Message(text, severity="note", code="flat-field")]
     if shown is FlatFieldUnknown.UNSURE:
         return list(sources), [NO_FLAT_FIELD]

@@ -97,8 +97,12 @@ class OutputFiles:
                 outputs.make_folder(extra.place)
         of_images = [file for image in self.images for file in _image_files(check_suffix(image))]
         beside = [file for extra in self.beside for file in extra.files]
-        check_outputs([*of_images, *self.files, *beside], outputs.overwrite, self.read)
+        check_outputs([*of_images, *self.files, *beside], self._may_exist, self.read)
         check_not_read([] if self.replaced_bag is None else [self.replaced_bag], self.read)
+
+    @property
+    def _may_exist(self) -> bool:
+        return self.run.outputs.overwrite or self.run.options.dry_run  # which writes nothing
 
     def check_places(self, sources: Sequence[Source], *, placed: bool = False) -> None:
         """Check world files too, once it is known whether the output will be georeferenced.
@@ -108,7 +112,7 @@ class OutputFiles:
         run = self.run
         if run.options.composite.georeference != "off" and (placed or has_place(sources)):
             files = [file for image in self.images for file in world_file_paths(image)]
-            check_outputs(files, run.outputs.overwrite)
+            check_outputs(files, self._may_exist)
         elif run.beside.has_poses_on_map:
             raise ArgumentError(
                 f"{run.beside.poses}: poses on the map need a georeferenced output, and GPS positions of "

@@ -37,8 +37,8 @@ _LOW_SHARE = 0.5
 class DetectedFeatures:
     """Features of N images, and how the images were rendered for detection."""
 
-    features: FeatureStore  # in pixels of the images; a damaged image has none
-    damaged: Mapping[int, str]  # why the pixels of an image could not be read, by its index
+    features: FeatureStore  # in pixels of the images; an unreadable image has none
+    unreadable: Mapping[int, str]  # why the pixels of an image could not be read, by its index
     stretch: Stretch | None = None  # grey levels that became 0 and 255 in all images; None: those of 8 bits
     equalized: tuple[int, ...] = ()  # images whose local contrast was equalized, as they showed too little otherwise
 
@@ -55,7 +55,7 @@ def _detect_all(
 ) -> DetectedFeatures:
     """Detect the features of every image, several images at a time, into ``store``."""
     features: list[StoredFeatures] = []
-    damaged: dict[int, str] = {}
+    unreadable: dict[int, str] = {}
     of_batch = partial(detect_batch, options=options, store=store)
     tasks = ((of_batch, batch) for batch in batches(sources, _IMAGES_AT_ONCE, _MIN_BATCHES))
     for batch in run_on_sources(executor, tasks, run.guard):
@@ -64,12 +64,12 @@ def _detect_all(
             if isinstance(detected, Unreadable):
                 if run.purpose is Purpose.PANO:
                     raise InputError(detected.reason)
-                run.guard.unreadable[source.path] = damaged[index] = detected.reason
+                run.guard.unreadable[source.path] = unreadable[index] = detected.reason
                 features.append(StoredFeatures.of(_no_features(options, source)))
             else:
                 features.append(detected)
         run.progress("detecting features", len(features), len(sources))
-    return DetectedFeatures(FeatureStore(tuple(features)), damaged, options.stretch)
+    return DetectedFeatures(FeatureStore(tuple(features)), unreadable, options.stretch)
 
 
 def detect_batch(
@@ -130,7 +130,7 @@ def detect_by_contrast(
     all_of_them = tuple(range(len(sources)))
     if not poor:
         return replace(detected, equalized=all_of_them if options.equalize else ())
-    most = 2 * len(poor) >= len(sources) - len(detected.damaged)
+    most = 2 * len(poor) >= len(sources) - len(detected.unreadable)
     chosen = all_of_them if most else tuple(poor)
     wanted = [sources[k] for k in chosen]
     common = options.stretch or stretch_of(wanted)
@@ -149,11 +149,12 @@ def _of_low_contrast(sources: Sequence[Source], detected: DetectedFeatures, opti
     """
     most, megapixels = options.limits
     counts, poor = np.minimum(_counts_of(detected.features.items), most), []
-    usual = float(np.median(np.delete(counts, list(detected.damaged)))) if len(detected.damaged) < len(counts) else 0.0
+    readable = np.delete(counts, list(detected.unreadable))
+    usual = float(np.median(readable)) if len(readable) else 0.0
     for index, (source, count) in enumerate(zip(sources, counts.tolist(), strict=True)):
         size = np.prod(source.metadata.size) / source.reduction(megapixels) ** 2 / 1e6
         few = count < _LOW_SHARE * min(most, max(_USUAL_DENSITY * size, usual))
-        if few and detected.features.items[index].low_contrast and index not in detected.damaged:
+        if few and detected.features.items[index].low_contrast and index not in detected.unreadable:
             poor.append(index)
     return poor
 

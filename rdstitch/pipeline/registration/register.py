@@ -77,7 +77,7 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
     aligned = aligner.completed(draft)
     settle = match_crossings if purpose.lens_only else settle_repeated_pattern
     aligned, undecided = settle(aligner, estimator, aligned, sources, detected.stretch, options.threads)
-    unplaced = {**other_lens, **detected.damaged, **undecided}
+    unplaced = {**other_lens, **detected.unreadable, **undecided}
     alignment, keypoints = aligned.alignment, tuple(features.counts.tolist())
     messages = [
         *alignment.messages,

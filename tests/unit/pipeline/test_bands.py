@@ -67,6 +67,14 @@ def _shift_between(first: Path, second: Path) -> float:
     return float(np.median(np.linalg.norm(shifts, axis=1)))
 
 
+def test_bands_of_other_bits_are_refused_by_what_they_have(tmp_path: Path) -> None:
+    for name, kind in (("red", np.uint8), ("nir", np.float32)):
+        for number in range(2):
+            tifffile.imwrite(tmp_path / f"{number}_{name}.tif", np.zeros((48, 64), kind))
+    with pytest.raises(ArgumentError, match="RED have 8 bits, those of NIR 32 bits"):
+        mosaic_bands([tmp_path], tmp_path / "out.tif", {"RED": "*_red.tif", "NIR": "*_nir.tif"})
+
+
 def test_a_band_by_another_lens_is_registered(rig: Path, tmp_path: Path) -> None:
     result = apply(rig / "red.tif.json", [rig / "nir"], tmp_path / "nir.tif", workers=1)
     assert result.matched == "name"

@@ -167,8 +167,10 @@ def test_measured_attitudes_are_used(tmp_path: Path) -> None:
     images = sequence_over(partial(ground, seed=1), lens, swaying).frames()
     options = rdstitch.StitchOptions(camera=CAMERA, tilt=(0.0, 0.0), attitude_std=0.0)
     tracker = rdstitch.Tracker(options, rdstitch.FollowedPoses(HEIGHT))
-    for nothing in ((math.nan, 0.0), (0.0, math.nan), (3.0, -2.0)):  # the last in degrees
-        assert "psi and theta must lie between" in tracker.add(images[0], attitude=nothing).reason
+    for nothing in ((math.nan, 0.0), (0.0, math.nan)):
+        assert "not known" in tracker.add(images[0], attitude=nothing).reason
+    nothing = (3.0, -2.0)  # degrees
+    assert "psi and theta must lie between" in tracker.add(images[0], attitude=nothing).reason
     found = [tracker.add(image, 0.1 * k, attitude=np.array(tilts[k])) for k, image in enumerate(images[:4])]
     assert "psi and theta" in tracker.add(images[3], attitude=nothing, odometry=(math.nan, 0.0, 0.0)).reason
     found += [tracker.add(image, 0.1 * k, attitude=tilts[k]) for k, image in enumerate(images[4:], 4)]

@@ -49,6 +49,7 @@ def test_arrays_of_any_library_with_positions() -> None:
 def test_a_lens_that_was_given_is_called_so() -> None:
     _, registration = rdstitch.place_tiles(TILES, positions=STAGE.nominal, distortion=0.01)
     assert registration.summary.endswith("λ = 0.0100 (given)")
+    assert any(message.text.startswith("6 images are too few to show") for message in registration.messages)
 
 
 @pytest.mark.parametrize("places", [[[1, 2], [3]], [["a", "b"]] * 6, [[0, 0]] * 7, {"x": [1] * 6, "y": [1] * 5}])

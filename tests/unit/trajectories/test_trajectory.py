@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from examples.judging.trajectories import compare_trajectories
 from rdstitch.alignment.result import PlanarPoses
 from rdstitch.errors import ArgumentError
-from rdstitch.export.trajectory_files import as_csv, as_kitti, as_tum
+from rdstitch.export.trajectory_files import as_csv, as_kitti, as_tum, path_as_svg
 from rdstitch.geometry.camera import Camera
 from rdstitch.synthetic.poses import Poses, texels_of_pixels
 from rdstitch.trajectories.trajectory import Trajectory
@@ -33,6 +33,16 @@ def test_a_path_starts_at_the_origin_with_the_height_given() -> None:
     # as the first frame sees it: Rz(yaw) (t - t0)
     c, s = np.cos(0.3), np.sin(0.3)
     np.testing.assert_allclose(path.position[1], np.array([[c, -s], [s, c]]) @ [1.0, 0.5] * 0.75)
+
+
+def test_a_path_of_one_frame_has_no_scale_and_one_of_none_can_be_shown() -> None:
+    poses = _poses()
+    single = replace(poses, yaw=np.where(np.arange(5) == 1, poses.yaw, np.nan))
+    path = Trajectory.from_poses(single)
+    assert "heights" not in path_as_svg(path)
+    assert "heights" in path_as_svg(Trajectory.from_poses(poses))
+    none = Trajectory(path.frame[:0], path.position[:0], path.yaw[:0], path.height[:0])
+    assert repr(none) == "<Trajectory 0 frames>"
 
 
 @pytest.mark.parametrize(("frame", "up"), [("enu", 1.0), ("camera", -1.0)])
