@@ -189,9 +189,9 @@ def _edited(data: bytes, edit: Callable[[Image.Exif], object]) -> bytes:
 
 
 def _written(exif: Image.Exif) -> bytes:
-    """An EXIF block; its text keeps its bytes, of which Pillow, who reads them as Latin-1, writes ASCII only."""
-    for tags in (exif, *map(exif.get_ifd, (ExifTags.IFD.Exif, ExifTags.IFD.GPSInfo))):
-        tags.update({tag: text.encode("latin-1") for tag, text in tags.items() if isinstance(text, str)})
+    """An EXIF block; names keep their bytes, of which Pillow, which reads them as Latin-1, would write ASCII only."""
+    names = {tag: text for tag, text in exif.items() if isinstance(text, str) and not text.isascii()}
+    exif.update({tag: text.encode("latin-1") for tag, text in names.items()})
     return exif.tobytes()
 
 

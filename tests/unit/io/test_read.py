@@ -183,13 +183,16 @@ class TestMetadata:
     def test_names_keep_their_bytes(self, tmp_path: Path, suffix: str, coding: str) -> None:
         author, exif = "© Jürgen Müller".encode(coding), Image.Exif()
         exif[0x013B] = exif[0x8298] = author
+        exif.get_ifd(0x8769)[0x9003] = "2024:05:06 07:08:09"
         Image.new("L", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
         metadata = read_metadata(tmp_path / "a.jpg")
         for written in (metadata, metadata.of_composite()):
             write_image(tmp_path / f"b.{suffix}", np.zeros((8, 8), np.uint8), metadata=written)
             with Image.open(tmp_path / f"b.{suffix}") as image:
                 tags = image.getexif()
+                time = tags.get_ifd(0x8769).get(0x9003)
             assert [tags[tag].encode("latin-1") for tag in (0x013B, 0x8298)] == [author, author]
+            assert time == (None if suffix == "ome.tif" else "2024:05:06 07:08:09")  # a text, and no bytes
 
     def test_place_and_attitude(self, tmp_path: Path) -> None:
         exif = Image.Exif()
