@@ -90,12 +90,12 @@ def _detected(source: Source, options: FeatureOptions, store: Cache) -> StoredFe
     """The features of an image, from an earlier run where the store has them."""
     network = store.file(options.aliked_model)
     # What stands for its content, whatever the file is called.
-    wanted = replace(options, aliked_model="") if network else options
+    wanted = replace(options, aliked_model=network) if network else options
     # Megapixels matter by what an image is halved to; they vary with the number of images.
     size, megapixels = source.camera.image_size, options.limits[1]
     halvings = None if megapixels is None else (halving(size, megapixels), halving(size, CLOSER * megapixels))
     wanted = replace(wanted, work_megapixels=None)
-    inputs = (source.content(store), source.mask_content(store), size, wanted, halvings, network)
+    inputs = (source.content(store), source.mask_content(store), size, wanted, halvings)
 
     def compute() -> PackedFeatures:
         return PackedFeatures.pack(detect_view(source.view, options))
