@@ -4,6 +4,7 @@ import json
 import re
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -277,7 +278,8 @@ def test_height_scales_positions_and_tum_has_eight_columns(rdstitch: Run, frames
 
 def test_the_name_of_a_path_says_its_format(rdstitch: Run, frames: list[Path], tmp_path: Path) -> None:
     arguments = ("trajectory", *frames, "--focal", "380", *CACHED)
-    for name, beginning in (("a.TUM", b"0.000000 0 0 1 "), ("a.bag", b"#ROSBAG V2.0"), ("a.txt", b"frame,name,")):
+    of_bag = [("a.bag", b"#ROSBAG V2.0")] if find_spec("rosbags") else []
+    for name, beginning in (("a.TUM", b"0.000000 0 0 1 "), ("a.txt", b"frame,name,"), *of_bag):
         rdstitch(*arguments, "-o", tmp_path / name)
         assert (tmp_path / name).read_bytes().startswith(beginning)
     rdstitch(*arguments, "-o", tmp_path / "kitti.tum", "--format", "kitti")
