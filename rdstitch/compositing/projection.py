@@ -60,7 +60,7 @@ class Plane(Projection):
         return x, y, np.ones(())
 
     def extent(self, max_stretch: float) -> tuple[float, float]:
-        """The limit where areas grow along an axis as the square of the distance."""
+        """The limit in x and y, of lengths away from the middle."""
         reach = math.sqrt(min(max_stretch, _MAX_STRETCH) - 1.0)
         return reach, reach
 
@@ -80,7 +80,7 @@ class _Longitude(Projection):
 
     @abstractmethod
     def _highest(self, stretch: float) -> float:
-        """The y up to which areas are stretched no more than so many times."""
+        """The y up to which lengths are stretched no more than so many times."""
 
     def project(self, directions: FloatArray) -> FloatArray:
         """Places of all directions; infinite at poles, where that is so."""

@@ -15,7 +15,7 @@ INTERPOLATION: dict[Interpolation, int] = {
     "cubic": cv2.INTER_CUBIC,
     "lanczos": cv2.INTER_LANCZOS4,
 }
-_TOO_LONG = 32767  # OpenCV resamples from no side as long as this, pixels
+TOO_LONG = 32767  # OpenCV resamples no side as long as this, pixels
 _KERNEL_MARGIN = 8  # room around a piece of an image for the kernel of the resampling, pixels
 _MIN_WEIGHT = np.float32(1e-6)
 
@@ -76,7 +76,7 @@ def _mirrored(reduction: int, geometry: Geometry) -> tuple[Float32Array, Float32
 
 def _remap_whole(pixels: AnyArray, map_x: Float32Array, map_y: Float32Array, interpolation: int) -> AnyArray:
     """``cv2.remap`` from an image; of a very long one, from the piece of it that is needed."""
-    if max(pixels.shape[:2]) < _TOO_LONG:
+    if max(pixels.shape[:2]) < TOO_LONG:
         return remap(pixels, map_x, map_y, interpolation)
     left, top = (max(0, int(m.min()) - _KERNEL_MARGIN) for m in (map_x, map_y))
     right, bottom = (int(m.max()) + 2 + _KERNEL_MARGIN for m in (map_x, map_y))

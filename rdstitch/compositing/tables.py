@@ -6,6 +6,7 @@ image, one product and one sum.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Self
 
 import cv2
@@ -17,9 +18,9 @@ from rdstitch.compositing.boxes import Box, cut
 from rdstitch.compositing.canvas import Canvas
 from rdstitch.compositing.photometric import DEPTHS, full_scale
 from rdstitch.compositing.preparation import decide, prepare_composite
-from rdstitch.compositing.resample import INTERPOLATION, remap, sample_places
+from rdstitch.compositing.resample import INTERPOLATION, TOO_LONG, remap, sample_places
 from rdstitch.compositing.source_images import PlacedImage, block_side, smoothed
-from rdstitch.errors import ArgumentError
+from rdstitch.errors import ArgumentError, LimitError
 from rdstitch.options.composite_options import CompositeOptions
 
 
@@ -42,6 +43,7 @@ class CompositeTables:
     _shares: tuple[_Share, ...]
     _offset: Float32Array | None  # (H, W, C), share of the full range
     _interpolation: int
+    channels: int  # of the images that are there now
 
     @classmethod
     def of(cls, images: Sequence[PlacedImage], canvas: Canvas, options: CompositeOptions) -> Self:
@@ -71,7 +73,9 @@ class CompositeTables:
             shrinks = tuple(warp.shrink for warp in renderer.warps)
             kernel = INTERPOLATION[options.interpolation]
             sizes = tuple(image.camera.image_size for image in images)
-            return cls(covered, sizes, shrinks, tuple(shares), offset, kernel)
+            if max(*covered.shape, *chain(*sizes)) >= TOO_LONG:
+                raise LimitError(f"images and output of tables must have sides below {TOO_LONG} pixels")
+            return cls(covered, sizes, shrinks, tuple(shares), offset, kernel, channels)
 
     def compose(self, images: Sequence[AnyArray]) -> AnyArray:
         """Put a set of images together.
@@ -82,7 +86,7 @@ class CompositeTables:
         self.check(images)
         first = images[0]
         channels = 1 if first.ndim == 2 else first.shape[2]
-        corrected = channels == self._shares[0].factors.shape[2]
+        corrected = channels == self.channels
         height, width = self.alpha.shape
         total = np.zeros((height, width * channels), dtype=np.float32)
         if corrected and self._offset is not None:

@@ -56,6 +56,8 @@ def mosaic_bands(
     no number of bands have only the latter. Returns the result of the first band, and those of the others, each
     composed with its own lens.
     """
+    if len(bands) < 2 or not all(bands) or not all(bands.values()) or {"/", "\\"} & set("".join(bands)):
+        raise ArgumentError(f"bands must be patterns by two names or more that files can have, not {dict(bands)}")
     file = Path(output)
     files = [file_of_part(file, name) for name in bands]
     given = RecipeInput.of(inputs, options, Purpose.MOSAIC, every)

@@ -66,14 +66,16 @@ class Composer:
         ----------
         images : iterable of ndarray of shape (h, w) or (h, w, C)
             One for each of :attr:`names`, of its size; uint8, uint16 or float32, channels in the order of the
-            result's images. Alpha, the last of two or four channels, is left out.
+            result's images. Alpha, the last of two or four channels that the result has fewer of, is
+            left out.
 
         Raises
         ------
         ArgumentError
             When number, size or kind of the images is another.
         """
-        given = [split_alpha(np.asarray(image))[0] for image in images]
+        arrays = map(np.asarray, images)
+        given = [a if a.shape[2:] == (self._tables.channels,) else split_alpha(a)[0] for a in arrays]
         self._tables.check(given)
         return to_channel_order(
             self._tables.compose([to_channel_order(image, self._order) for image in given]), self._order

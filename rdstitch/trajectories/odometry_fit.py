@@ -128,16 +128,16 @@ def along_odometry(
     fit = OdometryFit.of(motions_of(list(zip(places, path.yaw.tolist(), known, strict=True))))
     if fit is None:
         return None
+    by_images = 0.0 if math.isnan(path.length_std) else path.length_std
     if path.covariance is not None:
-        path = replace(path, covariance=without_length(path.covariance, path.position, path.length_std))
-    by_images = path.length_std
+        path = replace(path, covariance=without_length(path.covariance, path.position, by_images))
     if not keep_unit:
         path, fit = _in_unit_of(fit, path)
     path = bridged(path, bodies, fit)
     if path.covariance is not None:
         # A height that is the unit is exact; in another unit it is as uncertain as lengths by images, besides.
         height = np.zeros(len(path)) if keep_unit else path.height
-        shared = path.length_std * np.column_stack([path.position, height, np.zeros(len(path))])
+        shared = np.nan_to_num(path.length_std) * np.column_stack([path.position, height, np.zeros(len(path))])
         path.covariance[:] += shared[:, :, None] * shared[:, None]
         path.covariance[:, 2, 2] += (by_images * height) ** 2
     return path, fit

@@ -168,7 +168,8 @@ class Trajectory:
                 scale_std * np.stack([y, -x, zero, zero + 1.0]),
             ]
         )
-        return replace(path, covariance=covariance + np.einsum("kin,kjn->nij", shared, shared))
+        covariance = covariance + np.einsum("kin,kjn->nij", shared, shared)
+        return replace(path, covariance=covariance, length_std=scale_std)
 
     def __repr__(self) -> str:
         """One line: the number of frames and the length of the path."""

@@ -168,7 +168,6 @@ def _parse_bands(text: str) -> dict[str, str]:
     """Patterns of images by the names of bands, of ``NIR=*_NIR.TIF,RED=*_RED.TIF``."""
     pairs = [part.partition("=") for part in text.split(",")]
     bands = {name.strip(): pattern.strip() for name, _, pattern in pairs}
-    complete = len(bands) == len(pairs) > 1 and all(bands) and all(bands.values())
-    if not complete or {"/", "\\"} & set("".join(bands)):
+    if len(bands) < len(pairs) or not all(bands.values()):
         raise ArgumentError(f"--bands: {text!r} is not a list like NIR=*_NIR.TIF,RED=*_RED.TIF")
     return bands

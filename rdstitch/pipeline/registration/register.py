@@ -49,6 +49,7 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
         sources = with_image_circle(sources, executor, cache, run.guard, options.features.limits[1])
     aligner = Aligner.of(sources, options, cache, purpose)
     store = cache if run.cache is not None else Cache.for_this_run()
+    matching = _matching(options)  # a network that cannot be read is told before the work
     with ThreadPoolExecutor(1) as thread:
         thread.submit(import_module, "scipy.sparse.csgraph")  # 0.15 s, which alignments would wait for
         detected = detect_by_contrast(sources, options.features, run, executor, store)
@@ -56,7 +57,7 @@ def register(sources: Sequence[Source], run: Run, executor: Executor) -> Registr
     features = detected.features.at_sizes([camera.image_size for camera in cameras])
     candidates = first_pairs(features, options.seed, positions_of(sources))
     return_freed_memory()
-    matching, known, tilts = _matching(options), options.estimation, aligner.exact_tilts
+    known, tilts = options.estimation, aligner.exact_tilts
     estimator = PairEstimator(
         features, cameras, matching, known, progress, executor, cache=cache, store=store, tilts=tilts
     )

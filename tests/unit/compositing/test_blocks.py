@@ -162,6 +162,12 @@ def test_smaller_outputs_are_smoothed() -> None:
     assert np.median(error) < 0.02
 
 
+def test_sides_too_long_for_one_resampling_are_refused(six: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rdstitch.compositing.tables.TOO_LONG", six.canvas.size[0])
+    with pytest.raises(LimitError, match=f"below {six.canvas.size[0]} pixels"):
+        CompositeTables.of(six.images, six.canvas, FEATHERED)
+
+
 def test_what_does_not_fit_is_refused(six: Scene) -> None:
     tables = CompositeTables.of(six.images, six.canvas, FEATHERED)
     with pytest.raises(ArgumentError, match="expected 6 images, not 5"):

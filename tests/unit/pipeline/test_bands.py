@@ -67,6 +67,14 @@ def _shift_between(first: Path, second: Path) -> float:
     return float(np.median(np.linalg.norm(shifts, axis=1)))
 
 
+@pytest.mark.parametrize(
+    "bands", [{}, {"a": "*"}, {"a": "*", "": "*"}, {"a": "*", "b": ""}, {"a/b": "*", "c": "*.png"}]
+)
+def test_bands_without_names_or_patterns_are_refused(tmp_path: Path, bands: dict[str, str]) -> None:
+    with pytest.raises(ArgumentError, match="patterns by two names or more"):
+        mosaic_bands([tmp_path], tmp_path / "out.tif", bands)
+
+
 def test_bands_of_other_bits_are_refused_by_what_they_have(tmp_path: Path) -> None:
     for name, kind in (("red", np.uint8), ("nir", np.float32)):
         for number in range(2):

@@ -135,6 +135,16 @@ def test_covariances_are_right_of_frames_with_texture_and_without(
     assert np.mean(heights) < 1e-6 if keep_unit else 0.6 < np.mean(heights) < 1.5
 
 
+@pytest.mark.parametrize("keep_unit", [False, True])
+def test_a_path_whose_lengths_are_not_known_has_covariances(*, keep_unit: bool) -> None:
+    metres = _path()
+    shown = replace(metres, covariance=np.tile(1e-4 * np.eye(4), (len(metres), 1, 1)))
+    found = along_odometry(shown, dict(enumerate(_bodies(metres, 0.01))), keep_unit=keep_unit)
+    assert found is not None
+    assert found[0].covariance is not None
+    assert np.isfinite(found[0].covariance).all()
+
+
 def test_a_path_has_a_value_of_each_kind_a_frame() -> None:
     with pytest.raises(ArgumentError, match="a trajectory of 40 frames"):
         replace(_path(), name=("a.png", "b.png"))
