@@ -75,6 +75,9 @@ _DEPTH_IN_HEADER = {
     "JPEG2000": re.compile(rb"\xff\x4f\xff\x51.{38}(.)", re.DOTALL),
 }
 _MAX_HEADER = 2**21
+DEEP_MODES = ("RGB", "RGBA", "LA")
+"""Pillow's modes of samples that are 8-bit there, and may have been deeper."""
+
 _BIT_DEPTHS = {"1": 1, "I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
 _MAX_MAGIC = max(map(len, _FORMATS))
 _NAMES = "JPEG, PNG, TIFF, WebP, AVIF, HEIC, BMP, TGA, GIF, JPEG 2000, PBM, PGM, PPM"
@@ -164,14 +167,15 @@ def stored_bits(image: Image.Image) -> int:
     if image.format == "HEIF":
         return int(image.info["bit_depth"])
     stream, pattern = getattr(image, "fp", None), _DEPTH_IN_HEADER.get(image.format or "")
-    if stream is None or pattern is None:
+    if stream is None or pattern is None or image.mode not in DEEP_MODES:
         return _BIT_DEPTHS.get(image.mode, 8)
     place = stream.tell()
     stream.seek(0)
     found = pattern.search(stream.read(_MAX_HEADER))
     stream.seek(place)
     kind = 0 if found is None else found[1][0]
-    return 8 + 2 * (kind >> 6 & 1) + 2 * (kind >> 5 & 1) if image.format == "AVIF" else 1 + (kind & 0x7F)
+    bits = 8 + 2 * (kind >> 6 & 1) + 2 * (kind >> 5 & 1) if image.format == "AVIF" else 1 + (kind & 0x7F)
+    return bits if 8 < bits <= 16 else 8
 
 
 def has_late_metadata(file: Path) -> bool:

@@ -16,13 +16,23 @@ from rdstitch.errors import InputError
 from rdstitch.geometry.exif_orientation import turned
 from rdstitch.io.colour import without_inks
 from rdstitch.io.metadata import GREY_16, Metadata, is_grey, is_transparent, metadata_of, read_metadata
-from rdstitch.io.opening import PNG_MAGIC, TIFF_MAGIC, check_readable, decoding, is_raw, opened_image, reader_package
+from rdstitch.io.opening import (
+    DEEP_MODES,
+    PNG_MAGIC,
+    TIFF_MAGIC,
+    check_readable,
+    decoding,
+    is_raw,
+    opened_image,
+    reader_package,
+)
 from rdstitch.io.raw import read_raw
 from rdstitch.io.read_tiff import as_opacity, first_image_pages, read_page
 from rdstitch.io.reduction import block_mean, block_minimum, reduced_size
 from rdstitch.io.samples import OPAQUE, ROWS_AT_A_TIME, as_alpha, split_alpha
 from rdstitch.system.file_access import open_regular, read_beginning
 from rdstitch.system.late_imports import imagecodecs, tifffile
+from rdstitch.system.native_threads import silent_opencv
 
 _MAX_DECODED_REDUCTION = 8  # of the JPEG decoder
 _JPEG = ("JPEG", "MPO")
@@ -74,7 +84,7 @@ def read_image(path: str | Path, reduction: int = 1, metadata: Metadata | None =
         else:
             with opened_image(file) as opened:
                 metadata = metadata or metadata_of(opened)
-                if metadata.bit_depth > 8 and opened.mode in ("RGB", "RGBA", "LA"):
+                if metadata.bit_depth > 8 and opened.mode in DEEP_MODES:
                     samples, alpha = split_alpha(_deep_samples(file, opened, metadata.bit_depth))
                 else:
                     factor, decoded = _decoder_reduction(opened, metadata, reduction), None
@@ -95,7 +105,11 @@ def _deep_samples(file: Path, image: Image.Image, bits: int) -> AnyArray:
     else:
         data = read_beginning(file, _most_bytes(image.size))
         if image.format == "PPM":
-            samples = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))[..., ::-1]
+            with silent_opencv():  # to which the last number ends with its line
+                samples = cv2.imdecode(np.frombuffer(data + b"\n", np.uint8), cv2.IMREAD_UNCHANGED)
+            if samples is None:
+                raise ValueError("not enough image data")
+            samples = samples[..., ::-1]
         elif image.format == "AVIF":
             samples = imagecodecs.avif_decode(data, index=0)
         else:

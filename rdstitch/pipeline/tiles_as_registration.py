@@ -95,20 +95,20 @@ def _messages(sources: Sequence[Source], tiled: TileRegistration) -> tuple[Messa
     def named(tiles: Iterable[int]) -> str:
         return shortened(names_of([str(sources[k].path) for k in tiles]))
 
-    messages = []
-    if len(alone := np.flatnonzero(~tiled.linked)):
-        who = "1 tile has its place" if len(alone) == 1 else f"{len(alone)} tiles have their places"
-        text = (
-            f"{who} from the stage alone, ± {_rms(tiled.stds[alone]):.1f} pixels, since no neighbour shows the same: "
-            f"{named(alone)}"
-        )
-        messages.append(Message(text, severity="note", code="nominal-places"))
+    messages, alone = list[Message](), np.flatnonzero(~tiled.linked)
     if tiled.mostly_nominal:
         text = (
             f"{len(alone)} of {len(sources)} tiles have their places from the stage alone: they show nothing, or the "
             f"places ({tiled.grid.source}) or the overlap are wrong"
         )
         messages.append(Message(text, severity="failure", code="nominal-places"))
+    elif len(alone):
+        who = "1 tile has its place" if len(alone) == 1 else f"{len(alone)} tiles have their places"
+        text = (
+            f"{who} from the stage alone, ± {_rms(tiled.stds[alone]):.1f} pixels, since no neighbour shows the same: "
+            f"{named(alone)}"
+        )
+        messages.append(Message(text, severity="note", code="nominal-places"))
     if len(tiled.groups) > 1:
         others = [k for group in tiled.groups[1:] for k in group]
         text = (

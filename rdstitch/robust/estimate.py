@@ -58,7 +58,7 @@ class PairMatches:
         if self.tilts is not None and self.tilts.shape != (2, 2):
             raise ArgumentError(f"tilt must be (psi, theta) or one such pair an image, not of shape {self.tilts.shape}")
         if self.tilts is not None and not (np.abs(self.tilts) < np.pi / 2.0).all():
-            raise ArgumentError("tilt must be below a right angle, in radians")
+            raise ArgumentError("tilt must be finite and below a right angle, in radians")
 
     def __len__(self) -> int:
         """Number of matches."""

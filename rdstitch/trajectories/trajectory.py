@@ -157,7 +157,7 @@ class Trajectory:
         path = cls(frame, position, np.unwrap(poses.yaw[frame] + turn), poses.height[frame] * unit)
         if poses.covariance is None:
             return path
-        whole = np.diag([1.0, 1.0, unit, 1.0])
+        whole, length_std = np.diag([1.0, 1.0, unit, 1.0]), float(np.nan_to_num(length_std))
         whole[:2, :2] = change[:, :2]
         covariance = whole @ without_length(poses.covariance[frame], poses.position[frame], length_std) @ whole.T
         (x, y), zero = (position - change[:, 2]).T, np.zeros(len(frame))

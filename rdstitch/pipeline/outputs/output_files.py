@@ -123,7 +123,7 @@ class OutputFiles:
         """Stage the files beside an image; the result gets a warning for each that fails."""
         for each in self.beside:
             result = result.with_messages(self.run.outputs.attempt(each.place, partial(each.stage, result)))
-        if self.run.beside.poses is None:
+        if self.run.beside.poses is None or result.registration.alignment.poses is None:
             return result
         lengths = "heights above the ground, or places in units of them,"
         return result.with_messages(focal_unknown(lengths, result.registration.alignment.length_std))

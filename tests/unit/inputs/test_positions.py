@@ -101,7 +101,7 @@ def test_json_with_groups_takes_the_value_with_a_sign(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "altitude",
-    ["430 m Below Sea Level,", "430 m,Below Sea Level", "430,1", "-430,1", "430,3", "430 m,Negative Sea Level (…)"],
+    ["430 m Below Sea Level,", "430 m,Below Sea Level", "430,1", "-430,1.0", "430,3", "430 m,Negative Sea Level (…)"],
 )
 def test_altitudes_below_the_sea(tmp_path: Path, altitude: str) -> None:
     heading = "SourceFile,GPSLatitude,GPSLongitude,GPSAltitude,GPSAltitudeRef\n"

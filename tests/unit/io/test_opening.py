@@ -202,6 +202,27 @@ def test_deep_colours_are_read_in_full(tmp_path: Path, suffix: str, channels: in
         assert frame.decoded().metadata.bit_depth == 8
 
 
+def test_a_portable_pixmap_of_16_bits_needs_all_its_samples(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "text.ppm").write_bytes(b"P3 2 1 65535\n0 1 2 3 4 65535")
+    assert read_image(tmp_path / "text.ppm").pixels.tolist() == [[[0, 1, 2], [3, 4, 65535]]]
+    (tmp_path / "cut.ppm").write_bytes(b"P6 40 30 65535\n" + bytes(100))
+    with pytest.raises(InputError, match="not enough image data"):
+        read_image(tmp_path / "cut.ppm")
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(("bits", "channels", "stored"), [(20, 3, 8), (12, 1, 16)])
+def test_other_depths_of_jpeg_2000_are_those_that_pillow_gives(
+    tmp_path: Path, bits: int, channels: int, stored: int
+) -> None:
+    kind = np.uint32 if bits > 16 else np.uint16
+    samples = np.linspace(0, 2**bits - 1, 64 * 48).astype(kind).reshape(48, 64, 1).repeat(channels, 2)
+    encoded = imagecodecs.jpeg2k_encode(samples, level=0, codecformat="jp2", bitspersample=bits)
+    (tmp_path / "a.jp2").write_bytes(encoded)
+    image = read_image(tmp_path / "a.jp2")
+    assert (image.metadata.bit_depth, 8 * image.pixels.itemsize) == (stored, stored)
+
+
 def test_raw_files(tmp_path: Path) -> None:
     pytest.importorskip("rawpy")
     file = _dng(tmp_path / "a.dng")
